@@ -463,7 +463,7 @@ class Search:
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return the entries of the RigSolution at the best roll angle found so far, as one column. Shape (9, 1)."""
+        """Return joints, cost and status of the wind-tunnel rig at the best roll angle so far, as a column (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)

@@ -89,7 +89,7 @@ class ConstraintCheck(NamedTuple):
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
-        """Return whether, at the roll angle, the pitch link reaches the target, and joints 4 to 6 are within limits."""
+        """Return whether the rig's pitch link reaches the target, with joints 4 to 6 inside their limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def slide(self) -> Expression:
@@ -297,10 +297,10 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function from target and roll to the rig's cos q2, q1 and cos q4, with slopes of the first two.
+    """Return a casadi Function from target and roll angle to cos q2, q1 and cos q4 of the rig's joints q.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
-    respect to the roll. Other functions take the Function as their argument `chart`.
+    respect to the roll angle. Other functions take the Function as their argument `chart`.
     """
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     configuration = configuration_at(rig, t, c, s, branch=branch)

@@ -257,7 +257,7 @@ class Controller:
         return place
 
     def _build(self, functions: ProgramFunctions) -> tuple[Any, Any]:
-        """Return the solver, and the casadi Function of a step: a first attempt, and perhaps a second one."""
+        """Return the solver, and the casadi Function of a step, which solves again from another start if it fails."""
         transcription, form, settings = self._prepared.transcription, self._prepared.formulation, self.settings
         x, p = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np)
         cost, rows = functions.values(x, p)

@@ -235,7 +235,7 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """Horizon in seconds if the problem has signals; else 1, because the horizon may then be unknown."""
+        """Horizon in seconds if the problem has signals (known functions of time), which fix the horizon; else 1."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(

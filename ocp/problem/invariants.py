@@ -208,10 +208,7 @@ def null_projector(rows: np.ndarray) -> np.ndarray:
 
 
 def path_equalities(form: Formulation) -> np.ndarray:
-    """Return which path equalities may imply conditions on controls at the ends; none if there are no such conditions.
-
-    Shape (rows,), bool.
-    """
+    """Return a mask (rows,) of the path equalities that may imply the declared start or end conditions on controls."""
     ends = ca.vertcat(form.start.expression, form.end.expression)
     uses_control = not form.signals and form.nu > 0 and ca.depends_on(ends, ca.vertcat(form.u, form.u0))
     return np.asarray(form.path.equality & bool(uses_control))

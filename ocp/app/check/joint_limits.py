@@ -48,7 +48,7 @@ ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^
 
 
 class RowVerdict(StrEnum):
-    """Verdict on one row of the table of a check."""
+    """Verdict on one quantity in the table of results of `selfmotion check`, such as the velocity of a joint."""
 
     OK = "ok"
     FAILED = "FAILED"

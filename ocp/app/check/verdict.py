@@ -428,7 +428,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_segment(piece: Piece, times: Array, name: str) -> Check:
-    """Check one segment of a plan at both ends of the segment and at the given times in between."""
+    """Return the check of one segment of a plan against joint limits, at both ends and at given times inside."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))

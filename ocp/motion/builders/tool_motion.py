@@ -240,7 +240,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Optimal control problem of a tool motion while it is declared, with the machine, stretches and setup."""
+    """Optimal control problem of a tool motion while it is declared, with machine, time intervals and options."""
 
     problem: Problem
     machine: Machine

@@ -105,13 +105,16 @@ class StepBounds(Protocol):
         """Symmetric matrices of the quadratic terms. Shape (P, r, r)."""
 
     def select(self, rows: Any) -> Self:
-        """Return the bounds of the steps with the given indices."""
+        """Return the lower cost bounds of those steps that have the given indices."""
 
     def at(self, places: Array) -> tuple[Array, Array]:
         """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates nearer to a minimum of the bounds minus slope . t + t . curve . t / 2, or the same."""
+        """Return coordinates t at which the bounds, minus slope . t + t . curve . t / 2, are at most those at `places`.
+
+        All arguments have one entry for each step.
+        """
 
 
 class StepCost(ABC):

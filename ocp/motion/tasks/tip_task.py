@@ -490,7 +490,10 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations (count, k) of a matrix's first `count` rows in the span of its other rows."""
+    """Return coefficients of linear combinations of the first `count` rows of a matrix that its other rows span.
+
+    Each of the k combinations is a column; the columns are orthonormal. Shape (count, k).
+    """
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)
