@@ -326,7 +326,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan linked to its problem from a file; raise ProblemError if the problem does not match it."""
+        """Return the plan with the problem that was read from its file; raise ProblemError if the two do not match."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:

@@ -205,9 +205,9 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return the table that `corner_shape` interpolates: interior angles (rad), and shape factors divided by the chord.
+    """Return angles (rad) between two path segments, and the best shape factor of the curve that blends each corner.
 
-    The chord, the distance between the ends of the blend, is that at unit remaining distance.
+    The shape factors are divided by the distance between the ends of the blend, at unit distance from the corner.
     """
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))

@@ -165,7 +165,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 def clearance_of_pairs(problem: Problem, solution: Solution, name: str, pairs: Sequence[int]) -> Clearance:
-    """Return the `clearance` of some pairs of bodies of a separation constraint, whose bound is tight for the closest.
+    """Return the `clearance` of chosen pairs of bodies of a separation constraint; the closest pair has a tight bound.
 
     Args:
         problem: The problem.

@@ -184,8 +184,8 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene after checking that it is a scene of the machine and assumes joint limits only if these
-    apply; raise ProblemError otherwise.
+    """Return a collision scene; raise ProblemError if it belongs to another machine, or assumes that joints stay within
+    their limits although `limits` is False.
     """
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"

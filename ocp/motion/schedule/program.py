@@ -105,7 +105,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return a spline that has a subset of the coefficients, as if these coefficients were neighbours."""
+        """Return a spline whose consecutive coefficients are those of this spline at the given indices `at`."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)

@@ -129,7 +129,7 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Manifolds, each with the indices of its time samples and with its own indices of them."""
+        """Each manifold with its time samples: their indices along the path, and their row numbers in the manifold."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]

@@ -490,9 +490,9 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return coefficients of linear combinations of the first `count` rows of a matrix that its other rows span.
+    """Return the linear combinations of the first `count` rows of a matrix that are combinations of its other rows too.
 
-    Each of the k combinations is a column; the columns are orthonormal. Shape (count, k).
+    Each column has the coefficients of one combination; the columns are orthonormal. Shape (count, k).
     """
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
