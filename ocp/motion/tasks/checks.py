@@ -212,7 +212,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the number of each task equation in messages: its twist component 0..5, or with several tasks its index."""
+    """Return the number of each task equation in messages: its twist component 0..5; with several tasks its index."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
