@@ -7,6 +7,7 @@ left out; times are of the processor, toppra's and those beside it of the wall.
 from __future__ import annotations
 
 import importlib
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +25,9 @@ from scripts.papers.run import text_table
 from scripts.robots.panda import HOME, LAP, circling
 from scripts.robots.robots import PANDA
 from scripts.timing.measure import least_of_processor as least
+from scripts.timing.measure import timed
 from scripts.timing.optimal_control import installed
-from scripts.timing.schedules import JOINTS, Along, largest, peer_row
+from scripts.timing.schedules import JOINTS, Along, largest, random_arm
 
 STEPS = (60, 600, 6000)
 """Of a lap, for those that go from step to step."""
@@ -44,7 +46,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
     return {
         "local": local_rows(repeats),
         "postures": configuration_rows(),
-        "toppra": [row for seed in range(5) if (row := peer_row(seed)) is not None],
+        "toppra": [row for seed in range(5) if (row := toppra_row(seed)) is not None],
         "ruckig": ruckig_rows(),
         "versions": {name: installed(of) for name, of in DISTRIBUTIONS.items()},
     }
@@ -245,6 +247,45 @@ def ikpy_finder() -> Callable[[Array, Array], Array]:
 
 
 # ---- timing ------------------------------------------------------------------------------------------------------
+
+
+def toppra_row(seed: int) -> dict[str, Any] | None:
+    """Compare the schedule of a random arm without jerk limits with that of toppra; None if it is not installed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            toppra, constraint, algorithm = (
+                importlib.import_module(f"toppra{part}") for part in ("", ".constraint", ".algorithm")
+            )
+    except ImportError:
+        return None
+    toppra.setup_logging("ERROR")
+    path, joints, limits = random_arm(seed)
+    assert limits.joints is not None
+    bounds = JointLimits(limits.joints.velocity, limits.joints.acceleration)
+    free = LineLimits(100.0, 1000.0, np.inf, joints=bounds)
+    plan, seconds = timed(lambda: schedule(path, free, joints=joints))
+    s = np.linspace(0.0, path.length, 1000)
+    both = np.array([[-1.0, 1.0]])
+    velocity, acceleration = (np.asarray(each)[:, None] * both for each in (bounds.velocity, bounds.acceleration))
+
+    def planned() -> Any:
+        curve = toppra.SplineInterpolator(s, joints.at(s).position)
+        limited = [constraint.JointVelocityConstraint(velocity), constraint.JointAccelerationConstraint(acceleration)]
+        return algorithm.TOPPRA(limited, curve, gridpoints=s).compute_trajectory(0, 0)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        motion, peer_seconds = timed(planned)
+        rates = np.abs(motion(np.linspace(0.0, motion.duration, 50_001), 2)).max(axis=0)
+    return {
+        "seed": seed,
+        "seconds": seconds,
+        "toppra_s": peer_seconds,
+        "longer": float(plan.duration / motion.duration - 1),
+        "largest_demand": largest(plan, joints),
+        "toppra_acceleration_over_limit": float((rates / acceleration[:, 1]).max()),
+    }
 
 
 class Straight(Along):

@@ -1,15 +1,15 @@
-"""How fast schedules are made: a Panda under limits of all kinds, long paths, random arms, and toppra beside them.
+"""Computation time of schedules: a Panda under all kinds of limits, long paths, random arms, and toppra and copp-py.
 
-Memory is the peak of a process of its own, with what Python, the packages and the path take. The reference of the
-random arms is the package's own optimal control problem, which takes some 15 s an arm: two processes share them.
+The memory of a case is the peak of a separate process, which includes Python, the packages and the path. Schedules of
+random arms are compared with the package's own optimal control problem, which takes about 15 s for each arm; two
+processes share this work. Schedules of random splines of seven joints are compared with toppra and copp-py, one after
+the other in one process.
 """
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import resource
-import warnings
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -31,32 +31,35 @@ from scripts.timing.blend import random_task
 from scripts.timing.measure import least, timed
 
 LOW, HIGH = np.array([0.35, -0.2, 0.2]), np.array([0.55, 0.2, 0.45])
-"""Corners of the box in front of the Panda that its path stays in, m."""
+"""Corners of the box in front of the Panda that contains its path, m."""
 STEPS = (5e-3, 30e-3)  # m, shortest and longest line
-SAMPLES = 10  # of the joints, a line
+SAMPLES = 10  # number of joint samples per line
 JOINTS = JointLimits(
     velocity=[2.175] * 4 + [2.61] * 3,
     acceleration=[15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0],
     jerk=[750.0, 375.0, 500.0, 625.0, 750.0, 1000.0, 1000.0],
     torque=[87.0] * 4 + [12.0] * 3,
 )
-"""Of the Panda: those of its maker, jerks a tenth of them."""
+"""Limits of the Panda: those of its manufacturer, except the jerk limits, which are a tenth of them."""
 CASES = {
     "Panda, joint limits of all kinds": ((300, 1.0, None), (10_000, 30.0, 500.0)),
     "limits of the line and centripetal": ((10_000, None, None), (169_000, 20.0, 1500.0)),
 }
-"""Segments and goals of time (s) and memory (MB), by the case."""
+"""Numbers of segments with the goals of time (s) and memory (MB), by the case."""
 ARMS, WORKERS = 50, 2
 LONGER = (0.02, 0.05)
-"""Goals of the arms: time over the reference's, less one, in the median and at worst."""
+"""Goals of the random arms: largest relative excess of the duration over the reference, median and worst."""
+SPLINES = 50
+CHECKS = 50_001
+"""Number of times at which the limits of a motion are checked."""
 
 
-def run(repeats: int = 5, *, arms: int = ARMS, most: int = 200_000) -> dict[str, Any]:
-    """All figures, of paths of at most so many segments and of so many arms.
+def run(repeats: int = 5, *, arms: int = ARMS, most: int = 200_000, splines: int = SPLINES) -> dict[str, Any]:
+    """Measure all cases of at most `most` segments, and the given numbers of random arms and random splines.
 
     Returns:
-        "rows": seconds and memory by case. "arms": time beside the reference's by seed. "toppra": time beside
-        toppra's without a jerk limit, by seed; empty where it is not installed. "goals": of the arms.
+        "rows": seconds and memory by case. "arms": comparison with optimal control by seed. "peers": comparison with
+        toppra and copp-py by kind of limits and tool, empty without copp-py. "goals": those of the random arms.
     """
     sizes = [(case, size) for case, all_sizes in CASES.items() for size in all_sizes if size[0] <= most]
     spawned: dict[str, Any] = {"mp_context": multiprocessing.get_context("spawn"), "max_tasks_per_child": 1}
@@ -67,16 +70,18 @@ def run(repeats: int = 5, *, arms: int = ARMS, most: int = 200_000) -> dict[str,
         ]
     with ProcessPoolExecutor(WORKERS, mp_context=spawned["mp_context"]) as pool:
         longer = list(progress(pool.map(arm_row, range(arms)), "random arms", total=arms))
+    from scripts.timing.schedule_peers import compare_peers  # which imports this module
+
     return {
         "rows": rows,
         "arms": longer,
-        "toppra": [one for seed in range(min(arms, 10)) if (one := peer_row(seed)) is not None],
+        "peers": compare_peers(splines),
         "goals": {"median": LONGER[0], "worst": LONGER[1]},
     }
 
 
 def row(case: str, segments: int, repeats: int) -> dict[str, Any]:
-    """One schedule in this process."""
+    """Measure one schedule in this process."""
     runs = max(1, min(repeats, 1000 // segments))
     if case.startswith("Panda"):
         path, joints = panda_path(segments)
@@ -98,7 +103,10 @@ def row(case: str, segments: int, repeats: int) -> dict[str, Any]:
 
 
 def panda_path(segments: int, seed: int = 1) -> tuple[SmoothPath, PlannedJoints]:
-    """Random lines in front of a Panda with corners rounded to 1 mm, and its joints by damped steps along them."""
+    """Return random lines in front of a Panda, with corners rounded within 1 mm, and its joints along them.
+
+    The joints follow by damped steps of inverse kinematics.
+    """
     rng, points = np.random.default_rng(seed), [np.array([0.45, 0.0, 0.3])]
     while len(points) <= segments:
         step = rng.normal(size=3)
@@ -123,17 +131,17 @@ def panda_path(segments: int, seed: int = 1) -> tuple[SmoothPath, PlannedJoints]
 
 
 class Along:
-    """Joints at the distances of a path: waves.
+    """Joints that follow sine waves of the distance along a path.
 
     Attributes:
-        names: Of the joints.
+        names: Names of the joints.
     """
 
     def __init__(self, names: tuple[str, ...], size: Array, wave: Array, phase: Array) -> None:
         self.names, self.size, self.wave, self.phase = names, size, wave, phase
 
     def at(self, distance: Any) -> Any:
-        """Joints and three derivatives. Shape (M, n) each."""
+        """Return joint positions and their first three derivatives by the distance. Shape (M, n) each."""
         angle = np.asarray(distance, dtype=float)[:, None] * self.wave + self.phase
         kinds = ("position", "first", "second", "third")
         values = [self.size * self.wave**k * np.sin(angle + k * np.pi / 2) for k in range(len(kinds))]
@@ -141,7 +149,7 @@ class Along:
 
 
 def random_arm(seed: int) -> tuple[SmoothPath, Along, LineLimits]:
-    """Two to seven joints that swing along some lines, and limits of velocity, acceleration and jerk."""
+    """Return a path of some lines, two to seven joints that swing along it, and limits of velocity to jerk."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(2, 8))
     points = np.cumsum(rng.uniform(0.1, 0.5, (int(rng.integers(2, 7)), 1)) * rng.normal(size=(1, 3)), axis=0)
@@ -156,15 +164,23 @@ def random_arm(seed: int) -> tuple[SmoothPath, Along, LineLimits]:
     return path, Along(names, size, wave, phase), limits
 
 
-def largest(plan: Schedule, joints: Along) -> float:
-    """Largest demand of a joint over its limit, between the nodes too."""
-    moved = joint_motion(joints, plan.at(np.linspace(0.0, plan.duration, 50_001)))[1:]
-    bounds = plan.limits.of_joints(len(joints.names))
-    return max(float(np.max(np.abs(value) / bound)) for value, bound in zip(moved, bounds, strict=True))
+def largest(plan: Schedule, joints: Any) -> float:
+    """Return the largest usage of a joint limit by a schedule: 1 is the limit."""
+    return usage(plan, joints, plan.limits.joints or JointLimits())
+
+
+def usage(timing: Any, joints: Any, limits: JointLimits) -> float:
+    """Return the largest ratio to its limit of a joint velocity, acceleration, jerk or torque at `CHECKS` times."""
+    motion = timing.at(np.linspace(0.0, timing.duration, CHECKS))
+    values = dict(zip(("velocity", "acceleration", "jerk"), joint_motion(joints, motion)[1:], strict=True))
+    if np.isfinite(limits.torque).any():
+        v, a, torques = motion.speed[:, None], motion.acceleration[:, None], joints.torques(motion.distance)
+        values["torque"] = torques.inertia * a + torques.drag * v**2 + torques.rest
+    return max(float(np.max(np.abs(value) / getattr(limits, kind))) for kind, value in values.items())
 
 
 def arm_row(seed: int) -> dict[str, Any]:
-    """The schedule of a random arm beside the least time that optimal control finds."""
+    """Compare the schedule of a random arm with the least time found by optimal control."""
     path, joints, limits = random_arm(seed)
     plan, seconds = timed(lambda: schedule(path, limits, joints=joints))
     best = solve_minimum_time(path, limits, joints, guess=plan, intervals=60, rounds=0)
@@ -174,50 +190,11 @@ def arm_row(seed: int) -> dict[str, Any]:
     }
 
 
-def peer_row(seed: int) -> dict[str, Any] | None:
-    """The schedule of a random arm without limits of jerk beside toppra's; None where that is not installed."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            toppra, constraint, algorithm = (
-                importlib.import_module(f"toppra{part}") for part in ("", ".constraint", ".algorithm")
-            )
-    except ImportError:
-        return None
-    toppra.setup_logging("ERROR")
-    path, joints, limits = random_arm(seed)
-    assert limits.joints is not None
-    bounds = JointLimits(limits.joints.velocity, limits.joints.acceleration)
-    free = LineLimits(100.0, 1000.0, np.inf, joints=bounds)
-    plan, seconds = timed(lambda: schedule(path, free, joints=joints))
-    s = np.linspace(0.0, path.length, 1000)
-    both = np.array([[-1.0, 1.0]])
-    velocity, acceleration = (np.asarray(each)[:, None] * both for each in (bounds.velocity, bounds.acceleration))
-
-    def planned() -> Any:
-        curve = toppra.SplineInterpolator(s, joints.at(s).position)
-        limited = [constraint.JointVelocityConstraint(velocity), constraint.JointAccelerationConstraint(acceleration)]
-        return algorithm.TOPPRA(limited, curve, gridpoints=s).compute_trajectory(0, 0)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        motion, peer_seconds = timed(planned)
-        rates = np.abs(motion(np.linspace(0.0, motion.duration, 50_001), 2)).max(axis=0)
-    return {
-        "seed": seed,
-        "seconds": seconds,
-        "toppra_s": peer_seconds,
-        "longer": float(plan.duration / motion.duration - 1),
-        "largest_demand": largest(plan, joints),
-        "toppra_acceleration_over_limit": float((rates / acceleration[:, 1]).max()),
-    }
-
-
 # ---- the page ------------------------------------------------------------------------------------------------
 
 
 def report(numbers: dict[str, Any]) -> str:
-    """The times, and what is longer than it need be."""
+    """Return tables of the times and a sentence on the durations of the random arms."""
     lines = [text_table(numbers["rows"], 4)]
     longer = np.array([one["longer"] for one in numbers["arms"]])
     if longer.size:
@@ -226,16 +203,16 @@ def report(numbers: dict[str, Any]) -> str:
             f"{longer.size} random arms: {np.median(longer):+.3%} in the median, {longer.max():+.3%} at worst, beside "
             f"optimal control (goals {LONGER[0]:.0%} and {LONGER[1]:.0%}); largest demand {demand:.4f} of a limit"
         )
-    if numbers["toppra"]:
-        lines.append(text_table(numbers["toppra"], 4))
+    if numbers["peers"]:
+        lines.append(text_table(numbers["peers"], 4))
     return "\n\n".join(lines)
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:
-    """Seconds a thousand segments with the goals, and how much longer the arms take."""
+    """Draw the time per segment with the goals, and the relative excess of the duration of the random arms."""
     note = (
-        f"Left: one run on one machine, ticks the goals. Right: schedules of {len(numbers['arms'])} random arms beside "
-        "the package's own minimum-time problem; less than none is faster."
+        f"Left: one run on one machine; the ticks are the goals. Right: {len(numbers['arms'])} random arms, schedules "
+        "compared with the package's own minimum-time problem; negative values are faster."
     )
     with drawing.sheet(path, (1, 2), (9.0, 3.2), note) as (_, axes):
         left, right = np.ravel(axes)

@@ -16,6 +16,7 @@ from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from models import FixedBase, Path, SmoothPath, planar_chain, smooth
 from ocp import joint_path
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, ToolLimits, schedule
+from ocp.motion.schedule import grid as grids
 from tests.models.paths.task_paths import seeds
 from tests.ocp.problems import Array
 
@@ -176,6 +177,27 @@ def test_a_reversed_path_takes_the_same_time(seed: int) -> None:
     limits = replace(FREE, joints=random_limits(seed % 1000))
     there, back = (schedule(UNIT, limits, joints=Curves(seed, backward=end)).duration for end in (False, True))
     assert there == pytest.approx(back, rel=1e-4)
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 100.0])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 10))])
+def test_half_the_nodes_never_make_a_motion_faster_than_the_optimum(
+    monkeypatch: pytest.MonkeyPatch, seed: int, jerk: float
+) -> None:
+    """The optimum is that of a grid with four times as many nodes as by default."""
+    limits = replace(FREE, jerk=1e4 * jerk, joints=replace(random_limits(seed), jerk=jerk))
+    default, plans = grids.SETTINGS, {}
+    for spacing in (0.25, 1.0, 2.0):
+        lengths = {name: spacing * getattr(default, name) for name in ("build_up", "ramp", "turn", "least_build_up")}
+        # the error of interpolation grows with the square of the spacing
+        errors = {name: spacing**2 * getattr(default, name) for name in ("uneven", "uneven_speed")}
+        segments = round(default.segments / spacing)
+        monkeypatch.setattr(grids, "SETTINGS", replace(default, segments=segments, **lengths, **errors))
+        plans[spacing] = schedule(UNIT, limits, joints=Curves(seed))
+        assert greatest_usage(plans[spacing]) <= 1.001
+    nodes = {spacing: len(plan.profile.jerk) for spacing, plan in plans.items()}
+    assert nodes[2.0] < 0.7 * nodes[1.0] < 0.3 * nodes[0.25]
+    assert min(plans[1.0].duration, plans[2.0].duration) >= plans[0.25].duration * (1 - 1e-4)
 
 
 SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(3, 100))]
