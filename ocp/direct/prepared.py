@@ -286,19 +286,20 @@ class Prepared:
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
         """Run the solver from each alternative initial point until a run succeeds or the time limit is reached.
 
-        Together they take at most the iterations of the first attempt. If no function is ever finite, the start does
-        not matter.
+        Together they take at most the iterations of the first attempt. If functions are not finite near the guess nor
+        near zeros, no simulation of the dynamics is tried: an integrator can take minutes to fail.
         """
         attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
         limits, p = (arguments["lbx"], arguments["ubx"]), arguments["p"]
-        sizes = sizes_along(self._pattern, x0, first.names, bounds=bounds, p=p).of_variables(self.transcription)
+        sizes = self._sizes(x0, first.names, bounds, p)
         for start, point in alternative_starts(self.formulation, self.transcription, x0, p, bounds=limits, sizes=sizes):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
-            if attempts[-1].is_final:
+            never_finite = len(attempts) > 1 and all(attempt.is_broken for attempt in (first, *attempts))
+            if attempts[-1].is_final or never_finite:
                 break
             remaining -= attempts[-1].outcome.iterations
         return attempts

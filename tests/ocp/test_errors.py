@@ -63,7 +63,7 @@ def test_a_failure_carries_the_constraint_to_relax(method: Any) -> None:
         (lambda p: p.state("x", lower=2.0, upper=1.0), "x", 2.0),
         (lambda p: p.state("x", initial=[3.0, 1.0], upper=2.0), "x", 3.0),
         (lambda p: p.state("x", size=0), "size", 0),
-        (lambda p: p.control("u", guess=np.nan), "u", [np.nan]),
+        (lambda p: p.control("u", guess=np.nan), "u", np.nan),
         (lambda p: p.horizon(-1.0), "horizon", -1.0),
         (lambda p: p.path("wall", 1.0), "wall", None),
         (lambda p: Collocation(4, 12), "degree", 12),
@@ -125,7 +125,7 @@ def test_parameters_of_every_kind_are_taken(value: Any) -> None:
     [
         (None, Collocation(2), "a Problem is expected, not NoneType"),
         (Collocation(2), energy(), "a Problem is expected, not Collocation"),
-        (energy(), None, r"a method such as Collocation\(...\) is expected, not None"),
+        (energy(), 3, r"a method such as Collocation\(...\) is expected, not 3"),
         (energy(), Collocation, "a method such as"),
         (energy(), "radau", "a method such as"),
         (energy(), {"intervals": 3}, "a method such as"),

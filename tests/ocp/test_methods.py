@@ -39,7 +39,7 @@ def test_a_prepared_problem_solves_as_a_new_one(method: Any) -> None:
         )
 
 
-@pytest.mark.parametrize("method", [None, "collocation", Collocation, 3])
+@pytest.mark.parametrize("method", ["collocation", Collocation, 3])
 def test_invalid_methods_are_refused(method: Any) -> None:
     with pytest.raises(ProblemError, match="a method such as Collocation") as caught:
         solve(energy(), method)

@@ -157,7 +157,7 @@ def test_waypoints_are_passed_whatever_is_unknown() -> None:
     turns = quaternion_from_rotation(np.array([ca.DM(pose.rotation).full() for pose in poses]))
     path = plan(unknown, Waypoints(places, turns), scene=False)
     assert path.cost == plan(machine, Waypoints(places, turns), scene=False).cost
-    untimed = pytest.raises(ProblemError, match="a joint with a velocity limit")
+    untimed = pytest.raises(ProblemError, match="give a joint a velocity limit")
     with untimed, pytest.warns(ModelWarning, match="velocity"):
         plan(unknown, Waypoints(places, turns), scene=False, cost=Cost(velocity=0.0, time=1.0))
     limits = Limits(velocity=machine.robot.velocity)
