@@ -52,7 +52,8 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
 from ocp.problem.tables import Table, table
 from ocp.refinement import RefinementSettings, refine
-from ocp.solution import Sensitivity, Solution
+from ocp.solution import Solution
+from ocp.solution_data import Sensitivity
 from ocp.solution_data import register as _register
 from ocp.tightening import tighten
 

@@ -25,8 +25,6 @@ from ocp.refinement import RefinementSettings, refine
 from ocp.solution import ByName, Guess, Solution
 from ocp.tolerances import SOLVER_SHARE
 
-__all__ = ["AdaptiveCollocation", "default_method"]
-
 FIRST_MESHES: tuple[DirectMethod, ...] = (
     Collocation(12), Collocation(20), MultipleShooting(40, steps=2), Collocation(40), Collocation(120, 4)
 )  # fmt: skip

@@ -17,12 +17,6 @@ from models.checks import NOT_NUMBERS, ROUNDING, Checks, argument_of, floats
 from models.errors import DetailedError, ModelError
 from models.files import INPUT_LIMITS
 
-__all__ = [
-    "AuditError", "BoundWarning", "DetailedError", "Interrupted", "ProblemError", "RefinementWarning", "SolveError",
-    "SolverStatus", "StorageWarning", "checked_time_limit", "error_names", "format_distinct", "problem_errors",
-    "require", "sample_times", "values_within",
-]  # fmt: skip
-
 
 class ProblemError(DetailedError, ValueError):
     """Error about an invalid problem, method or argument, detected before anything is solved."""

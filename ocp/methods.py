@@ -24,11 +24,9 @@ from ocp.direct.sensitivity import METHODS
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
-from ocp.solution import ByName, Guess, Solution, check_variables_match
-from ocp.solution_data import call_registered
+from ocp.solution import ByName, Guess, Solution
+from ocp.solution_data import call_registered, check_variables_match
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE
-
-__all__ = ["Certificate", "Comparison", "Method", "PreparedProblem", "certificate", "prepare", "solve"]
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,11 @@ from ocp.errors import ProblemError, RefinementWarning, SolveError, SolverStatus
 from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import ByName, Guess, Refinement, Solution, stack
+from ocp.solution import ByName, Guess, Solution
+from ocp.solution_data import Refinement, stack
 from ocp.switching import WARM_START_OPTIONS, locate_switches, nodes_at_switches
 from ocp.tightening import tighten
 from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
-
-__all__ = ["RefinementSettings", "refine", "refine_from", "split"]
-
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 INTEGRATION = "integration error, relative"

@@ -42,28 +42,9 @@ from ocp.solution_data import (
     plain,
     read_head,
     read_status,
-    stack,
-    tightening_at,
     unstack,
 )
 from ocp.storage import read_arrays, write_arrays
-
-__all__ = [
-    "NODE_TOLERANCE",
-    "ByName",
-    "Guess",
-    "Refinement",
-    "Sample",
-    "Sensitivity",
-    "Solution",
-    "check_structure",
-    "check_variables_match",
-    "match_order",
-    "read_head",
-    "stack",
-    "tightening_at",
-    "unstack",
-]
 
 ByName: TypeAlias = Mapping[str, Any] | None  # parameters, options of a solver
 Guess: TypeAlias = "Solution | Mapping[str, Any] | None"

@@ -23,8 +23,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import ByName, Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE
 
-__all__ = ["WARM_START_OPTIONS", "Switches", "locate_switches", "nodes_at_switches", "solve_at_switches", "switches"]
-
 
 @dataclass(frozen=True)
 class SwitchingSettings:

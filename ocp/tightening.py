@@ -18,10 +18,9 @@ from ocp.direct.transcription import check_meshed
 from ocp.errors import SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import NODE_TOLERANCE, ByName, Guess, Solution
+from ocp.solution import ByName, Guess, Solution
+from ocp.solution_data import NODE_TOLERANCE
 from ocp.tolerances import SOLVER_SHARE
-
-__all__ = ["largest_excess", "tighten"]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_structure, check_variables_match, match_order, stack, unstack
+from ocp.solution import Solution
+from ocp.solution_data import check_structure, check_variables_match, match_order, stack, unstack
 from ocp.tolerances import (
     CLEARANCE_TOLERANCE_M,
     COSTATE_SHARE,
@@ -31,8 +32,6 @@ from ocp.tolerances import (
     SOLVER_SHARE,
     UNFIT_COSTATE_SHARE,
 )
-
-__all__ = ["COST_LOST", "Audit", "Finding", "audit", "clearance_finding"]
 
 COST_LOST = "cost lost, relative"
 """Name of the finding that reports how much more a plan costs than the nearest extremal, relative to the cost."""

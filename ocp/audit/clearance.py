@@ -27,7 +27,8 @@ from ocp.problem.enclosures import PrescribedMotion
 from ocp.problem.formulation import Formulation
 from ocp.problem.hulls import BodyPairs, Frames, Separation, frames_of
 from ocp.problem.problem import Problem
-from ocp.solution import Solution, check_variables_match, match_order
+from ocp.solution import Solution
+from ocp.solution_data import check_variables_match, match_order
 
 MAX_PRINTED = 4
 """Largest number of pairs that a text lists as left out of the proof by assumption; `Clearance.assumed` has all."""

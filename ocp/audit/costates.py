@@ -19,7 +19,7 @@ import numpy as np
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import find_control_multipliers, nnls, pseudo_inverse_of
 from ocp.curves import lagrange
-from ocp.solution import stack
+from ocp.solution_data import stack
 from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from ocp.audit.sizes import Sizes, nearest_bound, share_sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import Sampler
-from ocp.solution import Solution, stack
+from ocp.solution import Solution
+from ocp.solution_data import stack
 from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 
 MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150

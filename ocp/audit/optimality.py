@@ -26,8 +26,6 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 
-__all__ = ["Optimality", "optimality"]
-
 PROXIMITY_WEIGHT = 1e-5
 """Weight of the relative mean square distance from the reported costates, which selects among equally good
 multipliers."""

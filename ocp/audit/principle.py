@@ -16,24 +16,9 @@ import numpy as np
 
 from ocp.audit.linearisation import Linearisation
 from ocp.problem.formulation import Formulation
-from ocp.solution import Solution, stack
+from ocp.solution import Solution
+from ocp.solution_data import stack
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
-
-__all__ = [
-    "Hamiltonian",
-    "clebsch",
-    "control_loss",
-    "describe_singular_arcs",
-    "find_control_multipliers",
-    "groups",
-    "hamiltonian",
-    "is_convex",
-    "nnls",
-    "pseudo_inverse_of",
-    "reduced_slope",
-    "slope",
-    "switching_loss",
-]
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ from ocp.problem.values import symbols_of
 from ocp.solution import ByName, Solution
 from ocp.storage import checked_path, write_text
 
-__all__ = ["ControlStep", "Controller", "ControllerSettings"]
-
 HESSIANS = ("gauss-newton", "exact")
 QUIET = {"print_header": False, "print_iteration": False, "print_status": False, "print_time": False}
 QUIET_QP = {"print_header": False, "print_iter": False, "print_info": False, "error_on_fail": False}

@@ -25,8 +25,6 @@ from ocp.errors import require
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
-__all__ = ["Collocation", "MultipleShooting"]
-
 THIRDS = np.linspace(0.0, 1.0, 4)  # nodes of a cubic polynomial: relative positions 0, 1/3, 2/3, 1
 
 

@@ -20,8 +20,6 @@ from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["STARTS", "Samples", "alternative_starts", "displace", "guessed_names", "initial_point", "shifted_indices"]
-
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
 

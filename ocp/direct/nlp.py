@@ -21,19 +21,6 @@ from ocp.errors import ProblemError, SolveError, SolverStatus
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 
-__all__ = [
-    "SOLVERS",
-    "SOLVER_RESIDUAL",
-    "Outcome",
-    "broken_down",
-    "build_solver",
-    "call_solver",
-    "controls_at",
-    "horizon_of",
-    "iteration_limit",
-    "solution_of",
-]
-
 SOLVER_RESIDUAL = 1e-8
 """Residual of gradients and constraint rows, relative to the largest multiplier and variable, that is accepted where
 rounding prevents a smaller residual. In the solver's scaled units it is also the smallest significant multiplier."""

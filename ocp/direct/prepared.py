@@ -49,8 +49,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.storage import checked_path
 
-__all__ = ["DirectMethod", "Prepared"]
-
 
 class DirectMethod(MeshedMethod):
     """A direct method, for which a problem is prepared once and solved many times."""

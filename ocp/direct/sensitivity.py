@@ -21,9 +21,8 @@ from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.values import symbols_of
-from ocp.solution import Sensitivity, Solution
-
-__all__ = ["METHODS", "sensitivity"]
+from ocp.solution import Solution
+from ocp.solution_data import Sensitivity
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 """Classes of the direct methods by the name of the type that a solution stores."""

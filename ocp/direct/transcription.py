@@ -22,8 +22,6 @@ from ocp.problem.formulation import Formulation, Rows
 from ocp.problem.values import numeric
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["MeshedMethod", "TranscriptionBuilder", "check_meshed"]
-
 
 @dataclass(frozen=True)
 class Layout:

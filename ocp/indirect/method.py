@@ -32,7 +32,8 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import evaluate_at_samples
-from ocp.solution import ByName, Guess, Solution, check_variables_match
+from ocp.solution import ByName, Guess, Solution
+from ocp.solution_data import check_variables_match
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 

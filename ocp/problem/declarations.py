@@ -11,12 +11,6 @@ import numpy as np
 from ocp.errors import ProblemError
 from ocp.problem.hulls import Hull, Separation
 
-__all__ = [
-    "ENDS", "RECORD_KINDS", "Constraint", "Declarations", "Guess",
-    "Horizon", "PhaseTimes", "Signal", "Value", "Variable",
-]  # fmt: skip
-
-
 Value = Any  # a number, an array, or a casadi expression of parameters
 Guess = Any  # a value, or a function of time that returns one
 ENDS = ("initial", "terminal")

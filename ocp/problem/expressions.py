@@ -24,8 +24,6 @@ from ocp.problem.values import (
     table,
 )
 
-__all__ = ["ExpressionReader", "check_guess", "number_of_entries", "read_scale", "signal_function"]
-
 
 @dataclass(frozen=True)
 class ExpressionReader:

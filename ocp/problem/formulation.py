@@ -18,8 +18,6 @@ from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
 
-__all__ = ["BoundTable", "Bounds", "Formulation", "Rows"]
-
 Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
 

@@ -31,8 +31,6 @@ from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.problem.values import constant, identity, is_symbolic, numeric
 
-__all__ = ["Phase", "Phases"]
-
 DURATION = "duration"
 """Name of the state that represents the free duration of a phase."""
 

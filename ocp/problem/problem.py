@@ -31,8 +31,6 @@ from ocp.problem.record_reader import from_record
 from ocp.problem.record_writer import to_record
 from ocp.problem.values import check_inside, constant, identity
 
-__all__ = ["Problem", "checked_problem", "remembers_request"]
-
 Declare = TypeVar("Declare", bound=Callable[..., Any])
 Arguments = ParamSpec("Arguments")
 Declared = TypeVar("Declared", bound="Problem")

@@ -19,8 +19,6 @@ import scipy
 
 from ocp.errors import ProblemError, require
 
-__all__ = ["Table", "table"]
-
 DEGREE = 3
 
 

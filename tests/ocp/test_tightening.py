@@ -16,7 +16,7 @@ from models import FixedBase, planar_chain
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
 from ocp.direct.prepared import Prepared
 from ocp.problem.formulation import Formulation
-from ocp.solution import match_order, tightening_at
+from ocp.solution_data import match_order, tightening_at
 from tests.ocp.problems import double_integrator, plant, van_der_pol
 
 pytestmark = pytest.mark.xdist_group("tightening")  # one process, so that every plan is tightened once

@@ -26,9 +26,9 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from models.errors import ModelError
+from models.errors import DetailedError, ModelError
 from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
-from ocp.errors import DetailedError, ProblemError, SolveError
+from ocp.errors import ProblemError, SolveError
 
 Function = Callable[..., Any]
 CACHE_SIZE = 8

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from models.errors import DetailedError
 from ocp.app.batch.result_store import ResultStore
-from ocp.errors import DetailedError, ProblemError, SolveError, require
+from ocp.errors import ProblemError, SolveError, require
 from ocp.storage import cell, checked_path, write_text, write_whole
 
 COLUMNS = ("key", "status", "cost", "verdict", "seconds", "error", "message")

@@ -30,7 +30,8 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.targets import Target
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
-from ocp.solution import Solution, match_order
+from ocp.solution import Solution
+from ocp.solution_data import match_order
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,10 @@ import numpy as np
 import scipy
 
 from models import FixedBase, Machine
-from models.checks import NOT_NUMBERS, floats
+from models.checks import NOT_NUMBERS, Array, floats
 from models.robot.dynamics import GRAVITY, inverse_dynamics
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import PathLike
-from ocp.motion.tasks.speed_profile import Array
 from ocp.solution import Solution
 
 DEGREE = 5

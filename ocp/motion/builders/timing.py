@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
@@ -39,7 +40,7 @@ from ocp.motion.schedule.limits import (
     rates_along,
 )
 from ocp.motion.schedule.planner import Schedule, schedule
-from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, integrate_jerk, segment_index
+from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, integrate_jerk, segment_index
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 

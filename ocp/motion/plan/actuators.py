@@ -35,15 +35,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE
 
-__all__ = [
-    "cost_of_motion",
-    "largest_demand",
-    "limits_actuators",
-    "solve_with_accelerations",
-    "weights_actuators",
-    "without_actuators",
-]
-
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
 

@@ -25,8 +25,6 @@ from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlannerSettings
 from ocp.solution import Solution
 
-__all__ = ["CandidateQueue", "Solver"]
-
 
 class Solver:
     """Base class of the solvers that advance the candidate motions of one request from stage to stage.

@@ -52,8 +52,6 @@ from ocp.problem.values import constant
 from ocp.refinement import refine_from, split
 from ocp.solution import Solution
 
-__all__ = ["CandidateSolver"]
-
 
 class CandidateSolver(Solver):
     """Solver of the candidate motions of a machine on a fixed or floating base.

@@ -45,11 +45,6 @@ from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = [
-    "goal_configurations", "has_only_target", "plan_capture", "plan_goal", "plan_sequence",
-    "plan_steps", "plan_to_stand", "with_joints",
-]  # fmt: skip
-
 PHASE_INTERVALS = 40
 """Number of intervals of the first mesh, summed over all phases; no phase gets more than a single motion would."""
 REGION_SAMPLES, REGION_STARTS = 8, 16

@@ -47,8 +47,6 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 from ocp.storage import read_arrays
 
-__all__ = ["Search", "load_plan", "plan", "plan_problem"]
-
 MAX_TIGHTENINGS = 6
 """Largest number of motions that are planned, each with tighter torque limits, until one covers its uncertainties."""
 Search: TypeAlias = Literal["start", "configurations", "global", "segments"]

@@ -45,11 +45,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "GoalRequest", "GoalSettings", "GoalTask", "attains_bound", "cost_bound", "motions_along",
-    "synchronised_candidates",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class GoalSettings:

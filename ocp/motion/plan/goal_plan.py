@@ -37,8 +37,6 @@ from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 
-__all__ = ["plan_to_goal"]
-
 
 @interruptible
 def plan_to_goal(request: GoalRequest) -> SolvedPlan:

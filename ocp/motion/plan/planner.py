@@ -57,15 +57,6 @@ from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = [
-    "PlanOptions",
-    "candidates_from",
-    "checked_request",
-    "clearance_for",
-    "plan_from_configurations",
-    "plan_request",
-]
-
 UNLIMITED_RATE = 1.0
 """Rate assumed for joints without a rate limit when the cost of an approach is estimated, rad/s or m/s."""
 

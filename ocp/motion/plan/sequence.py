@@ -41,8 +41,6 @@ from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, retime_task
 
-__all__ = ["plan_consecutive", "plan_in_segments"]
-
 AT_START = 1e-6
 """Largest pose error, m and rad, with which a configuration counts as being at the start of a task or at a goal."""
 

@@ -41,8 +41,6 @@ from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["plan_path"]
-
 WAYPOINT = "waypoint {:g}"
 NO_PATH = "no path through the waypoints keeps all limits"
 

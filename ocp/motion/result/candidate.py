@@ -26,11 +26,6 @@ from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.configurations import PlanRequest
 from ocp.solution import Solution
 
-__all__ = [
-    "Candidate", "MotionSample", "Reason", "Rejection", "Seed", "Stage", "collision_reason",
-    "shortfall_reason",
-]  # fmt: skip
-
 
 class Stage(IntEnum):
     """Stage of the solution process that a candidate has reached."""

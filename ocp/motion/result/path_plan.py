@@ -27,8 +27,6 @@ from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.solution import Solution
 from ocp.tolerances import CLEARANCE_TOLERANCE_M, RESOLVED_SHARE
 
-__all__ = ["PathPlan", "PathPoses"]
-
 POSE_TOLERANCE = 1e-6
 """Largest pose error at a waypoint, m and rad."""
 STEP_TOLERANCE = 1e-6

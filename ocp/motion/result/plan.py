@@ -31,15 +31,10 @@ from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
 from ocp.problem.record_writer import pack_record
-from ocp.solution import MAX_LINES, Solution, read_head
-from ocp.solution_data import call_registered
+from ocp.solution import MAX_LINES, Solution
+from ocp.solution_data import call_registered, read_head
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
-
-__all__ = [
-    "CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "Rows", "audit_key", "describe_ends", "evaluate_parts",
-    "read_record", "reading_plan", "record_arrays",
-]  # fmt: skip
 
 ENDS = "speed at both ends"
 """Name of the audit finding that tells whether a motion starts and ends at rest."""

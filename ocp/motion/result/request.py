@@ -62,8 +62,6 @@ from ocp.problem.problem import Problem
 from ocp.problem.record_reader import RECORD_ERRORS, FunctionReader
 from ocp.problem.record_writer import FunctionWriter
 
-__all__ = ["RESERVE", "MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
-
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)

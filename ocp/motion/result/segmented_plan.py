@@ -24,8 +24,6 @@ from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target
 from ocp.solution import Solution
 
-__all__ = ["JUMP_TOLERANCE", "ConsecutivePlans", "Piece", "Reconfiguration", "SegmentedPlan", "SequencePlan"]
-
 NO_MOTION = "reconfigurations without a motion"
 JUMP_TOLERANCE = 1e-6
 """Largest difference of a joint position between the end of a motion and the start of the next motion, rad or m."""

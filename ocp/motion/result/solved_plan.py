@@ -26,8 +26,6 @@ from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
-__all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan"]
-
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"
 """Name of the array whose presence marks the file of a plan with several phases."""

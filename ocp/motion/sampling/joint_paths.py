@@ -36,16 +36,6 @@ from ocp.motion.local.collisions import Collision, find_collisions, near_pairs, 
 from ocp.problem.hulls import Frames, frames_of
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = [
-    "StraightMotions",
-    "optimise_length",
-    "path_length",
-    "points_along",
-    "same_class",
-    "shorten",
-    "shortest_through_corners",
-]
-
 Indices = NDArray[np.intp]
 COMPARED_PLACES = 32
 """Number of fractions of their length at which two paths are compared."""

@@ -28,8 +28,6 @@ from ocp.motion.sampling.joint_paths import (
     shorten,
 )  # fmt: skip
 
-__all__ = ["JointPath", "PathSearchSettings", "TreeSearch", "connect", "find_paths"]
-
 Indices = NDArray[np.intp]
 
 

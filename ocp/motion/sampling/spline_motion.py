@@ -40,8 +40,6 @@ from ocp.motion.sampling.joint_paths import StraightMotions, points_along
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 
-__all__ = ["MotionLimits", "SplineCost", "SplineMotionSettings", "optimal_motion_near"]
-
 
 @dataclass(frozen=True)
 class SplineMotionSettings:

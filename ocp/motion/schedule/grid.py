@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.motion.schedule.limits import (
     BLOCK_SIZE,
@@ -26,7 +27,7 @@ from ocp.motion.schedule.limits import (
     limit_names,
     limit_rows,
 )
-from ocp.motion.tasks.speed_profile import Array, segment_index
+from ocp.motion.tasks.speed_profile import segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
 

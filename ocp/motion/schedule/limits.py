@@ -19,9 +19,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.checks import NOT_NUMBERS, floats
+from models.checks import NOT_NUMBERS, Array, floats
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.speed_profile import Array, LineMotion
+from ocp.motion.tasks.speed_profile import LineMotion
 from ocp.tolerances import ROUNDING_SHARE
 
 BLOCK_SIZE = 20_000

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times
 from ocp.motion.schedule.grid import Grid, coarse_grid, limit_slope, make_grid, node_minimum
@@ -31,7 +32,7 @@ from ocp.motion.schedule.limits import (
 from ocp.motion.schedule.ramps import Zones, plan_zones
 from ocp.motion.schedule.stretch import ACTIVE_SHARE, fastest_profile
 from ocp.motion.schedule.window import Stretch
-from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, ramp_distance, segment_index
+from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, join_profiles, ramp_distance, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
 

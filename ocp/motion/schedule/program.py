@@ -31,8 +31,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.checks import Array
 from ocp.errors import SolveError
-from ocp.motion.tasks.speed_profile import Array
 from ocp.tolerances import SOLVER_SHARE
 
 

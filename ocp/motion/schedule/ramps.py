@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
+from models.checks import Array
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import (
-    Array,
     Phases,
     SpeedProfile,
     integrate_jerk,

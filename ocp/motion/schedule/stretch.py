@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.checks import Array
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.schedule.grid import GAUSS, Grid, acceleration_bounds, limit_slope, node_minimum, reachable_squares
 from ocp.motion.schedule.limits import Rows, limit_rows
@@ -34,7 +35,7 @@ from ocp.motion.schedule.window import (
     parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
-from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, profile_between
+from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
 ACTIVE_SHARE = 0.98

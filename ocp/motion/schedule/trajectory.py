@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from models.checks import NOT_NUMBERS, floats
+from models.checks import NOT_NUMBERS, Array, floats
 from models.files import read_regular
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
 from ocp.motion.schedule.planner import Schedule
-from ocp.motion.tasks.speed_profile import Array, LineMotion
+from ocp.motion.tasks.speed_profile import LineMotion
 from ocp.storage import checked_path, column_name, joint_name, write_text
 
 MAX_FILE_BYTES = 2**26

@@ -10,9 +10,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from models.checks import Array
 from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
-from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, profile_through
+from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, profile_through
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,6 @@ from ocp.motion.search.configurations import REACH_TOLERANCE, PlanRequest, large
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.reduced import LimitSide, ReducedKinematics, TaskKinematics, check_floating_reach, limit_rates
 
-__all__ = ["CellSearch", "tracks_tasks"]
-
 Indices = NDArray[np.intp]
 
 MAX_VELOCITY_ERROR = 0.1

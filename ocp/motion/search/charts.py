@@ -29,8 +29,6 @@ from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ChartSettings", "Charts", "SelfMotionManifolds", "SplitCharts", "TimeSample", "concatenate", "point_chart"]
-
 Indices = NDArray[np.intp]
 
 

@@ -32,12 +32,6 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.targets import resolving_times
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = [
-    "REACH_TOLERANCE", "PlanRequest", "PlannerSettings", "SearchKind", "check_clear_start",
-    "count_clear_configurations", "describe_alternatives", "largest_pose_errors", "local_motions_from", "locate_error",
-    "start_collisions", "start_configurations",
-]  # fmt: skip
-
 SearchKind: TypeAlias = Literal["start", "configurations", "global"]
 REACH_TOLERANCE = 1e-4
 """Largest pose error at which a pose counts as reached, m or rad."""

@@ -25,8 +25,6 @@ from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.search.search import AtlasSearch
 from ocp.motion.search.value import ChartGraph
 
-__all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
-
 Indices = NDArray[np.intp]
 
 MAX_TRIALS = 3

@@ -39,16 +39,6 @@ from ocp.motion.search.search import MAX_FREE_DIRECTIONS
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 
-__all__ = [
-    "all_joints",
-    "fix_ignorable_joints",
-    "hold_idle_joints",
-    "move_aside",
-    "place_held_joints",
-    "release_obstructing",
-    "restore_error",
-]
-
 STIFFNESS = 1e6
 """Factor on the rate weights of joints shared with other limbs, which makes local motions hardly move these joints."""
 Error = TypeVar("Error", bound=Exception)

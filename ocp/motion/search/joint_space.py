@@ -14,18 +14,6 @@ from models import Machine, Robot
 from models.checks import Array
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = [
-    "FULL_TURN",
-    "MAX_STEP",
-    "TOLERANCE",
-    "JointSpace",
-    "TasksWithFixedJoints",
-    "all_turns",
-    "turning_joints",
-    "whole_turns_between",
-    "whole_turns_into",
-]
-
 Indices = NDArray[np.intp]
 
 TOLERANCE = 1e-9

@@ -30,8 +30,6 @@ from ocp.motion.search.steps import (
     rows_last,
 )
 
-__all__ = ["Homogeneous", "LargestMotion", "PathLength"]
-
 INTERIOR_STEPS = 8
 """Number of steps of the interior-point method for the multipliers of steps; each reduces the gap about tenfold."""
 CENTERING, STEP_SHARE = 0.1, 0.97

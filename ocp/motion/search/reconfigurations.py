@@ -27,8 +27,6 @@ from ocp.motion.search.charts import Charts, SelfMotionManifolds, SplitCharts
 from ocp.motion.search.joint_space import FULL_TURN, TasksWithFixedJoints
 from ocp.motion.search.search import AtlasSearch
 
-__all__ = ["SectionSearch", "SectionSettings", "Segment", "Span", "fewest_segments", "section_values", "segment_ends"]
-
 Span = tuple[int, int]
 """Indices of the first and the last time sample of a segment."""
 

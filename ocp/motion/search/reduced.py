@@ -32,9 +32,6 @@ from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_reach", "limit_rates"]
-
-
 START_GAP = 1e-4
 """Largest pose error, m or rad, with which a tip counts as being at its pose when a task starts."""
 SIMPSON_STEPS = 400

@@ -36,8 +36,6 @@ from ocp.motion.search.steps import QuadraticBounds, Steps
 from ocp.motion.search.value import ChartGraph
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
-
 MAX_FREE_DIRECTIONS = 2
 """Largest dimension of a self-motion manifold that can be searched; an atlas of more dimensions is too large."""
 

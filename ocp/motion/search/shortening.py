@@ -44,16 +44,6 @@ from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.tolerances import CLEARANCE_TOLERANCE_M, ROUNDING_SHARE
 
-__all__ = [
-    "PENALTY",
-    "PathPoses",
-    "PathProblem",
-    "ShorteningSettings",
-    "optimality_of",
-    "optimise_path",
-    "shorten_path",
-]
-
 Indices = NDArray[np.intp]
 
 CURVATURE_RADIUS = 1e-2

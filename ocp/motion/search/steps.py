@@ -17,11 +17,6 @@ import numpy as np
 from models.checks import Array
 from ocp.motion.search.charts import Charts
 
-__all__ = [
-    "CurvedCharts", "QuadraticBounds", "SquaredRates", "StepBounds", "StepCost", "Steps", "apply", "apply_transposed",
-    "dot", "least_in_box", "lowest_eigenvalue", "multiply_transposed", "rows_first", "rows_last",
-]  # fmt: skip
-
 MAX_CONCAVITY = 0.5
 """Largest concavity of a cost bound, relative to the curvature of a step's cost; more concave bounds are flattened."""
 

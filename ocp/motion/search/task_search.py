@@ -32,8 +32,6 @@ from ocp.motion.search.shortening import PathProblem
 from ocp.motion.search.steps import SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = ["TOO_MANY_CHARTS", "TaskSearch", "choose_samples", "lower_bound_along"]
-
 
 @dataclass(frozen=True)
 class SampleSettings:

@@ -28,8 +28,6 @@ from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import MAX_STEP, JointSpace
 from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, Steps
 
-__all__ = ["ChartGraph", "GraphSettings"]
-
 Indices = NDArray[np.intp]
 
 

@@ -18,12 +18,6 @@ from ocp.errors import ProblemError, format_distinct, require
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_rows, target_size
 
-__all__ = [
-    "are_at_rest", "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration",
-    "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
-    "ignorable_joints", "rates_at_rest",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class CheckSettings:

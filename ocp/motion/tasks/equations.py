@@ -45,8 +45,6 @@ from ocp.motion.tasks.tip_task import (
 )
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
-__all__ = ["TaskEquations", "bind", "task_errors"]
-
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:

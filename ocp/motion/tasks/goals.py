@@ -15,8 +15,6 @@ from ocp.errors import ProblemError, require
 from ocp.motion.tasks.checks import checked_configuration, checked_weights
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Cost", "Goal", "Scene", "Start", "Waypoints"]
-
 
 @dataclass(frozen=True, eq=False)
 class Start:

@@ -16,11 +16,6 @@ from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import expression
 from ocp.errors import ProblemError, require
 
-__all__ = [
-    "Anywhere", "Following", "InFoot", "IndexAtLeast", "JointBounds", "Limits", "Pinned", "ZmpRule", "check_rule",
-    "checked_point", "foot_edges", "foot_rows", "index_rows", "is_finite", "unknown_limits",
-]  # fmt: skip
-
 PARALLEL = 1e-12
 """Cosine between a direction and the normal of a support edge below which the edge counts as parallel to the direction.
 """

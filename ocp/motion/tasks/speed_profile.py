@@ -20,11 +20,6 @@ from models.checks import Array, short_repr
 from ocp.errors import ProblemError, require, values_within
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "Array", "LineMotion", "Phases", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_between",
-    "profile_through", "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
-]  # fmt: skip
-
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 

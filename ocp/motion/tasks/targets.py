@@ -18,8 +18,6 @@ from ocp.motion.tasks.tip_task import TipTask, target_rows, target_size
 from ocp.problem.values import Sampler
 from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE
 
-__all__ = ["Target", "required_nodes", "resolving_times", "targets_along", "tip_poses"]
-
 
 @dataclass(frozen=True)
 class NodeSettings:

@@ -24,8 +24,6 @@ from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
-__all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
-
 Velocity: TypeAlias = Any
 """Prescribed velocity: a constant or a function of time, with one entry for each row of the task."""
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]

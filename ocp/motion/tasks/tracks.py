@@ -22,11 +22,6 @@ from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import SpeedProfile
 
-__all__ = [
-    "PathTracks", "PoseLine", "Track", "TrackWithRate", "checked_speed", "on_symbols", "path_tracks", "pose_line",
-    "ramp_limits", "reparametrize", "track_expression",
-]  # fmt: skip
-
 Track: TypeAlias = Any
 """Target over time: a constant, or a function of CasADi time (s) that returns a vector, matrix or list of expressions.
 """

@@ -14,7 +14,8 @@ import pytest
 from models import CollisionScene, FixedBase, MovingObstacle, Sphere
 from ocp import ClearanceConstraints, Cost, Limits, Plan, ProblemError, Scene, Waypoints, plan
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.result.path_plan import PathPlan, PathPoses
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.search.shortening import PathPoses
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.test_waypoints import poses
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
