@@ -434,7 +434,7 @@ class Search:
             all_but_slide = check.all_but_slide()
             better = ca.logic_and(ca.logic_and(all_but_slide, check.slide()), value < cost)
             least = ca.fmin(least, value)
-            evaluations.append(Evaluation(ca.if_else(check.pitch_joints(), value, ca.inf), configuration.cos2))
+            evaluations.append(Evaluation(ca.if_else(check.is_pitch_reachable(), value, ca.inf), configuration.cos2))
             over = ca.if_else(all_but_slide, value, ca.inf)
             below = ca.fmin(below, ca.if_else(check.slide_lower, ca.inf, over))
             above = ca.fmin(above, ca.if_else(check.slide_upper, ca.inf, over))

@@ -86,9 +86,9 @@ class ConstraintCheck(NamedTuple):
 
     def all_but_slide(self) -> Expression:
         """Return whether all reach constraints and joint limits but those of joint 1 (the slide) are satisfied."""
-        return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
+        return ca.logic_and(self.is_pitch_reachable(), ca.logic_and(self.yaw, self.yaw_angles))
 
-    def pitch_joints(self) -> Expression:
+    def is_pitch_reachable(self) -> Expression:
         """Return whether the rig's pitch link reaches the target, with joints 4 to 6 inside their limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 

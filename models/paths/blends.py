@@ -327,7 +327,7 @@ def _speed(derivative: Array, u: Array) -> Array:
 
 
 def _half_square_slope(derivative: Array, u: Array) -> Array:
-    """Return half of the derivative of the squared speed with respect to u. Shapes (3, 5, M), (M,) to (M,)."""
+    """Return half of the derivative of the squared speed of M curves with respect to their parameter u. Shape (M,)."""
     total: Array = np.zeros(np.shape(u))
     for terms in derivative:
         value, slope = terms[4] * u + terms[3], terms[4].copy()

@@ -66,7 +66,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the order of variables by stage k: node k, copies of horizon and initial state, interval k, its end."""
+    """Return the order of variables in which those of a mesh interval, with a copy of its end, are consecutive."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs

@@ -108,7 +108,7 @@ class _Sequence:
 
     @property
     def horizon(self) -> Literal["free"] | None:
-        """Horizon of each motion of the sequence: "free", or None for the duration that its tasks or goal state."""
+        """Horizon of each motion of the sequence: "free", or None if its tasks or its goal state the duration."""
         return "free" if self.free else None
 
     @property

@@ -106,7 +106,7 @@ class StepBounds(Protocol):
         """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates t at which the bounds, minus slope . t + t . curve . t / 2, are at most those at `places`.
+        """Return coordinates t where bound(t) - slope . t - t . curve . t / 2 is not above its value at `places`.
 
         All arguments have one entry for each step.
         """

@@ -234,7 +234,7 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the weight of the squared velocity of each joint, its own times that of the term. Shape (size,).
+        """Return the weights of the squared joint velocities: `velocity` times the weight of each joint. Shape (size,).
 
         Raises:
             ProblemError: The number of weights is not the number of joints, or a weight is not positive.
