@@ -46,7 +46,8 @@ class AdaptiveCollocation:
             line on the terminal, False for nothing; None shows the line after two seconds.
 
     Raises:
-        ProblemError: accuracy is not between 0 and 1, or max_intervals is no positive integer.
+        ProblemError: accuracy is not between 0 and 1, or max_intervals is smaller than that of the finest
+            first mesh, 120.
     """
 
     accuracy: float = SOLVER_SHARE

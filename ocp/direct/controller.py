@@ -39,7 +39,7 @@ from ocp.direct.code_generation import (
 )
 from ocp.direct.guess import shifted_indices
 from ocp.direct.nlp import Outcome
-from ocp.errors import ProblemError, SolverStatus, require
+from ocp.errors import ProblemError, SolveError, SolverStatus, require
 from ocp.problem.values import symbols_of
 from ocp.solution import ByName, Solution
 from ocp.storage import checked_path, write_text
@@ -161,8 +161,8 @@ class Controller:
         Raises:
             ProblemError: A parameter is missing, unknown, of a wrong size or not finite, or a bound is not a number or
                 exceeds its upper bound at these parameters. The controller stays as it was.
-            RuntimeError: A function of the problem cannot be evaluated in the first step. In later steps the result of
-                the last one is held.
+            SolveError: A function of the problem is not finite in the first step. In later steps the result of the last
+                one is held.
         """
         began = time.perf_counter()
         form, tolerance = self._prepared.formulation, self.settings.tolerance
@@ -176,12 +176,13 @@ class Controller:
             values = dict(zip(OUTPUTS, self._run(p, *self._state, shift), strict=True))
             measures = np.concatenate([values[name] for name in MEASURES])
         except RuntimeError:  # a function of the problem is not finite, or cannot be evaluated
-            if not self._last:
-                raise
             values = self._last
         held = not np.all(np.isfinite(measures))
+        if held and not self._last:
+            words = f"controller: a function of problem {form.name!r} is not finite at these parameters, and no earlier"
+            raise SolveError(f"{words} step can be held; start again from a plan: reset(plan)", name=form.name)
         if held:
-            values = self._last or values
+            values = self._last
         else:
             self._state, self._last = (values["x"], values["lam_x"], values["lam_g"]), values
         self._is_first = False
