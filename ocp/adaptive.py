@@ -9,6 +9,7 @@ The plan of lower cost is refined.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +18,7 @@ from ocp.console import interruptible, report, shown_progress, time_left, time_l
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.direct.guess import guessed_names
 from ocp.direct.prepared import DirectMethod, Prepared
-from ocp.errors import SolveError, checked_time_limit, require
+from ocp.errors import RefinementWarning, SolveError, checked_time_limit, require
 from ocp.methods import descend
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -121,8 +122,16 @@ class AdaptiveProblem:
                 if time_left() <= 0:
                     break
             if best is not None:
+                words = f"problem {self.problem.name!r}: no refinement of the plan succeeded; its accuracy is unknown"
+                warnings.warn(RefinementWarning("\n".join([words, *ends]), name="accuracy"), stacklevel=2)
                 return best
-            raise self._failure(parameters, guess, ends)
+            mesh = Collocation(20)
+            prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
+            try:  # with all starts, and a report of conflicting constraints
+                plan = prepared.solve(parameters, guess)
+            except SolveError as error:
+                raise self._failure(error, guess, ends) from error
+            return self._refined(mesh, plan, parameters)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
         """Return the plan of a first mesh after refinement by collocation."""
@@ -168,15 +177,9 @@ class AdaptiveProblem:
                 break
         return min(plans, key=lambda plan: plan.cost, default=None)
 
-    def _failure(self, parameters: ByName, guess: Guess, ends: list[str]) -> SolveError:
-        """Return the error that no first mesh has a plan, with the conflicting constraints that a last solve finds."""
-        lines = [f"problem {self.problem.name!r} has no plan on any of the meshes tried"]
-        try:
-            Collocation(20).prepare(self.problem, options=FIRST_OPTIONS).solve(parameters, guess)
-            cause = SolveError()
-        except SolveError as error:
-            cause = error
-            lines += str(error).splitlines()
+    def _failure(self, cause: SolveError, guess: Guess, ends: list[str]) -> SolveError:
+        """Return the error that no first mesh has a plan, with the conflicting constraints that a last solve found."""
+        lines = [f"problem {self.problem.name!r} has no plan on any of the meshes tried", *str(cause).splitlines()]
         unknown = [name for name in self.formulation.states if name not in guessed_names(self.formulation, guess)]
         hint = f" states {', '.join(unknown)} have no guess" if unknown else ""
         free = self.formulation.horizon_is_free and "horizon" not in guessed_names(self.formulation, guess)
