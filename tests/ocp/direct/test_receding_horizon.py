@@ -12,7 +12,7 @@ import pytest
 import scipy
 
 from models.checks import Array
-from ocp import Collocation, ControlStep, MultipleShooting, Problem, ProblemError, prepare
+from ocp import Collocation, ControlStep, MultipleShooting, Problem, ProblemError, SolveError, prepare
 from ocp.direct.controller import gauss_newton_hessian, split_squares
 from ocp.direct.prepared import DirectMethod
 from scripts.timing.measure import has_compiler
@@ -322,3 +322,22 @@ def test_functions_without_c_code_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
     with pytest.raises(ProblemError, match="path"):
         of.to_c(3)
+
+
+def test_a_first_step_that_is_not_finite_is_refused_by_name() -> None:
+    problem = Problem("logarithm")
+    x0 = problem.parameter("x0")
+    x = problem.state("x", initial=x0)
+    u = problem.control("u", lower=-1.0, upper=1.0)
+    problem.dynamics(x, u)
+    problem.horizon(1.0)
+    problem.minimize(running=u**2 + ca.log(x0) * x**2)
+    prepared = prepare(problem, MultipleShooting(4))
+    controller = prepared.controller(prepared.solve({"x0": 2.0}))
+    with pytest.raises(SolveError, match="not finite") as caught:
+        controller.step({"x0": -1.0})
+    assert caught.value.name == "logarithm"
+    first = controller.step({"x0": 2.0})
+    held = controller.step({"x0": -1.0})
+    assert held.held
+    np.testing.assert_array_equal(held.control["u"], first.control["u"])
