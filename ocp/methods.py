@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -56,7 +56,11 @@ class PreparedProblem(Protocol):
         ...
 
 
-class Method(Protocol):
+P = TypeVar("P", bound=PreparedProblem)
+P_co = TypeVar("P_co", bound=PreparedProblem, covariant=True)
+
+
+class Method(Protocol[P_co]):
     """A method that solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
@@ -67,7 +71,7 @@ class Method(Protocol):
         options: ByName = None,
         compiled: bool = False,
         scaling: bool = True,
-    ) -> PreparedProblem:
+    ) -> P_co:
         """Prepare a problem once for repeated solves; see :func:`prepare`."""
         ...
 
@@ -75,13 +79,13 @@ class Method(Protocol):
 @interruptible
 def prepare(
     problem: Problem,
-    method: Method,
+    method: Method[P],
     *,
     solver: str = "ipopt",
     options: ByName = None,
     compiled: bool = False,
     scaling: bool = True,
-) -> PreparedProblem:
+) -> P:
     """Prepare a problem once, and return an object whose ``solve(parameters=, guess=)`` can be called repeatedly.
 
     Args:
@@ -115,7 +119,7 @@ def prepare(
 @interruptible
 def solve(
     problem: Problem,
-    method: Method | None = None,
+    method: Method[PreparedProblem] | None = None,
     *,
     parameters: ByName = None,
     solver: str = "ipopt",
