@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy suite global brute passages singular frauds fuzz fresh moving faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy suite global brute passages singular frauds fuzz fresh moving touches faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -86,6 +86,9 @@ frauds: $(VENV)/test.stamp ## falsify eight plans in 264 ways and audit them; ch
 
 moving: $(VENV)/test.stamp ## prove clearance from 200 random obstacles that jump and spin, and compare with coal (ARGS="--only ur5 --count 20")
 	$(BIN)/python -W ignore -m tests.sweep.moving_obstacles --out "$(OUT)/sweeps/moving_obstacles.jsonl" $(ARGS)
+
+touches: $(VENV)/test.stamp ## plant 100000 touches on moving arms: none is proven clear (ARGS="--only 'seven joints'")
+	$(BIN)/python -W ignore -m tests.sweep.touches --out "$(OUT)/sweeps/touches.jsonl" $(ARGS)
 
 faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster during batches of 500 plans, and fill a disk
 	$(BIN)/python -W ignore -m tests.sweep.faults

@@ -21,6 +21,7 @@ from ocp.motion.local.collisions import distances_along
 from scripts import drawing
 from scripts.papers.run import progress, text_table
 from scripts.robots.robots import PANDA, UR5
+from scripts.timing.clearance_peers import run_peers
 from scripts.timing.distances import scene
 from scripts.timing.planning import lanes
 
@@ -42,7 +43,7 @@ GOALS = {"proof": 0.5, "beside what does not bind": 1.5, "beside what binds": 4.
 def run(repeats: int = 5) -> dict[str, Any]:
     """Processor times, the least of some runs."""
     matches = [row for case in progress(CASES, "clearance") for row in plans(case, max(1, min(repeats, 3)))]
-    return {"rows": matches, "proofs": proofs(repeats), "goals": GOALS}
+    return {"rows": matches, "proofs": proofs(repeats), "peers": run_peers(repeats), "goals": GOALS}
 
 
 def proofs(repeats: int) -> list[dict[str, Any]]:
@@ -138,7 +139,8 @@ def ball(plain: Plan, link: str) -> Sphere:
 def report(numbers: dict[str, Any]) -> str:
     """The times, and what is asked."""
     request = "asked: a proof in 0.5 s, plans at most 1.5 times the plain one beside what does not bind, 4 times beside"
-    return f"{text_table(numbers['rows'], 4)}\n{text_table(numbers['proofs'], 4)}\n{request} what binds"
+    tables = "\n".join(text_table(numbers[part], 4) for part in ("rows", "proofs", "peers"))
+    return f"{tables}\n{request} what binds"
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:
