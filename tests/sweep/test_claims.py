@@ -82,10 +82,20 @@ def test_the_page_of_bounds_has_the_gaps_and_times_of_the_rows() -> None:
         tasks = " .*?".join([r"(\d+) of a"] * len(kinds))
         pattern = rf"\| {redundant} \| {tasks}[^|]*" + r"\| ([\d.]+) to ([\d.]+) % \| ([\d.]+) to ([\d.]+) s"
         assert claimed("docs/theory/bound.md", pattern) == [*counts, min(gaps), max(gaps), min(times), max(times)]
+        largest = rf"exceeded the bound by .*?at most ([\d.]+) % with {redundant}"
+        assert claimed("docs/tutorials/waypoints.md", largest) == [max(gaps)]
 
 
-def test_the_page_of_waypoints_has_the_lengths_of_the_rows() -> None:
-    for row in rows_of(ROOT / "results" / "sweeps" / "redundancy.jsonl").values():
+def test_the_page_of_waypoints_has_the_lengths_and_gaps_of_the_rows() -> None:
+    rows = rows_of(ROOT / "results" / "sweeps" / "redundancy.jsonl").values()
+    *close, middle, largest = sorted(100 * ((row["rad"] + row["m"]) / row["bound"] - 1) for row in rows)
+    pattern = r"exceeds the bound by at most ([\d.]+) %, in `fetch square` .*? by ([\d.]+) %, and in .*? by (\d+) %"
+    gaps = [round(max(close), 1), round(middle, 1), round(largest)]
+    assert claimed("docs/tutorials/waypoints.md", pattern) == gaps
+    *usual, slowest = sorted(round(row["seconds"]) for row in rows)
+    times = claimed("docs/tutorials/waypoints.md", r"takes (\d+) to (\d+) s of processor time, .*? (\d+) s")
+    assert times == [usual[0], usual[-1], slowest]
+    for row in rows:
         name = row["kind"].replace("__", " ")
         extra = r" and ([\d.]+) m" if row["m"] > 0.0 else ""
         *lengths, bound = claimed(
