@@ -67,7 +67,7 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
         axes[0, 0].legend(loc="lower right")
         time_bar(figure, axes, local.t[-1], fraction=0.04, pad=0.02)
     turn = np.degrees(np.ptp(optimal.base[:, 2]))
-    title = f"In the optimum, the tip follows its line while the free base turns by {turn:.0f}°"
+    title = f"Optimum: the tip follows its line, the free base turns by {turn:.0f}°"
     with sheet(folder / "optimal_motion.png", (1, 1), (5.4, 5.8), note, title=title) as (figure, axes):
         _strobe(axes[0, 0], machine, optimal)
         axes[0, 0].set(xlabel="x, m", ylabel="y, m")
