@@ -21,6 +21,7 @@ from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SITE = ROOT / "docs"
 PAGES = (README, *sorted(SITE.rglob("*.md")))
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
@@ -192,3 +193,14 @@ def test_the_page_of_the_architecture_lists_every_module() -> None:
         if file.name != "__init__.py":
             there.setdefault(str(file.parent.relative_to(ROOT)), []).append(file.stem)
     assert listed == there
+
+
+def test_the_index_of_formulas_names_the_modules_that_contain_them() -> None:
+    """At least half of the words of each entry are in the modules of its row, by their first six letters."""
+    rows = re.findall(r"^\| ([^|`]+) \| (`(?:models|ocp)/[^|]+) \|$", CONTRIBUTING, re.MULTILINE)
+    assert len(rows) >= 30
+    for formulas, modules in rows:
+        text = "".join((ROOT / name).read_text(encoding="utf-8") for name in re.findall(r"`([^`]+)`", modules)).lower()
+        for formula in re.sub(r"\(.*?\)", "", formulas).split(","):
+            stems = [word[:6] for word in re.findall(r"[a-z]{4,}", formula.lower())]
+            assert 2 * sum(stem in text for stem in stems) >= len(stems) > 0, f"{formula!r} is not in {modules}"

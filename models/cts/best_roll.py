@@ -298,7 +298,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function that searches the ends of feasible roll intervals that are due to yaw joints 2 and 3.
+        """Return the Function that compares the incumbent with ends of roll intervals at limits of yaw joints 2 and 3.
 
         (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
         evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a

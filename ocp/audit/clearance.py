@@ -350,7 +350,7 @@ class _Search:
         self._evaluate(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
     def _evaluate(self, when: np.ndarray) -> None:
-        """Compute the distance of each pair at a separate time, given as a fraction of the horizon in ``when`` (n,)."""
+        """Compute the distance of each pair at its own time, which ``when`` (n,) gives as a fraction of the horizon."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
         self._store_smallest(pair, gap, when, points)

@@ -258,7 +258,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs of bodies at all samples, or lower bounds above `near`. Shape (M, n), m.
+        """Return the distances of all pairs at all samples; those above `near` are lower bounds. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -283,7 +283,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of pairs of bodies at given samples, or lower bounds above `near`. Shape (K,), m."""
+        """Return the distances of pairs at given samples; those above `near` are lower bounds. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 

@@ -272,7 +272,7 @@ def _remainder(x: Interval, y: Interval) -> Interval:
 
 
 def _reduce(x: Interval, y: Interval, rounded: Callable[[Any], Any], low: Array, high: Array) -> Interval:
-    """Return the range of x minus y times the rounded quotient x / y, which lies between `low` and `high` (M,)."""
+    """Return the range of x - y * rounded(x / y), which is known to lie between `low` and `high`. Shape (M,) each."""
     multiple, known = multiple_of(x, y, rounded)
     result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     return Interval(

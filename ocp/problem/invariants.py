@@ -105,7 +105,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 
 def monomials(part: np.ndarray) -> np.ndarray:
-    """Return all monomials of given states up to the highest allowed degree, as indices of 3 factors. Shape (m, 3)."""
+    """Return all monomials of given states as triples of state numbers; 0 stands for the factor 1. Shape (m, 3)."""
     degree = max(d for d in range(MAX_DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     rows = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (MAX_DEGREE - degree) + row for row in rows if any(row)], int).reshape(-1, MAX_DEGREE)

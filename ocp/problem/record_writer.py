@@ -110,7 +110,7 @@ class FunctionWriter:
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
     def _as_scalars(self, function: Any) -> Any:
-        """Convert a function to one of SX symbols, which calls other functions for, say, table look-ups."""
+        """Convert a function to a function of SX symbols, which may call other functions, such as table look-ups."""
         kind = function.class_name()
         if kind == "SXFunction":
             return function

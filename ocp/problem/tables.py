@@ -79,7 +79,7 @@ def table(points: Any, values: Any) -> Table:
 
 
 def _weights(points: np.ndarray, x: Any) -> Any:
-    """Return the weights of the values at n points in the spline at ``x``, an expression. Shape (n, 1).
+    """Return the weights by which the spline at the expression ``x`` combines the values at n points. Shape (n, 1).
 
     The coefficients of the piece that contains ``x`` are the first ones plus the differences at the knots passed, whose
     derivatives vanish.

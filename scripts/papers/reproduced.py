@@ -58,7 +58,7 @@ def _free_floating(report: Mapping[str, Any]) -> Iterator[Printed]:
     printed, caveats = report["paper"], report["caveats"]
     ours = {"pseudo-inverse": report["pseudo_inverse"], "optimum": report["optimal"]}
     reasons = {
-        "pseudo-inverse": "link length and mount are not printed: 2.1 mm of length make up for all of the first peak",
+        "pseudo-inverse": "link length and mounting are not printed: links 2.1 mm longer explain the first peak",
         "optimum": "the horizon is not printed, ours is 5 s; no extremal found at other horizons has these peaks",
     }
     for method, why in reasons.items():
@@ -80,8 +80,8 @@ def _free_floating(report: Mapping[str, Any]) -> Iterator[Printed]:
 
 def _standing(report: Mapping[str, Any]) -> Iterator[Printed]:
     why = (
-        "pinning the zero moment point is unstable at the level of accelerations: {} there. With the sign of C as "
-        "printed in (22) the motion of Figure 4 goes on, with an index that is not 1"
+        "prescribing the zero moment point by joint accelerations is unstable: {} at our time. With the sign of C as "
+        "printed in equation (22), the motion of Figure 4 continues, but its stability index is not 1"
     )
     words = {"lift_off": "the machine lifts off", "divergence": "the joint rates diverge"}
     cases = {
@@ -102,8 +102,8 @@ def _blend(report: Mapping[str, Any]) -> Iterator[Printed]:
         for name, value, ours in zip(columns, PAPER_GAMMA[remaining], result, strict=True):
             yield Printed("blend", "Table 2", f"gamma, Lr {remaining} mm, {name}", value, ours, 3)
     why = (
-        "no reading of the mean acceleration gives all four: the ramp to the first one is not printed; the durations "
-        "of both blends agree to 2.5 ms"
+        "no interpretation of the mean acceleration yields all four times, and the ramp before the first blend is not "
+        "printed. The durations of both blends agree to 2.5 ms"
     )
     for number, (value, ours) in enumerate(zip(PAPER_TIMES, report["blend_times_s"], strict=True), 1):
         yield Printed("blend", "Figure 14", f"begin or end of a blend, {number} of 4, s", value, ours, 3, why)
@@ -114,10 +114,12 @@ def _blend(report: Mapping[str, Any]) -> Iterator[Printed]:
 
 def _cts(report: Mapping[str, Any]) -> Iterator[Printed]:
     printed, ours = report["paper"]["table6_s"], report["arithmetic_seconds_of_200_targets"]
-    why = "the time of another computer; ours is arithmetic alone, compiled"
+    why = "computing times of different computers; ours is that of the compiled arithmetic alone"
     for name, mine in (("jacobian", "jacobian, gain 20"), ("combined", "combined")):
         yield Printed("cts", "Table 6", f"200 targets, {name}, s", printed[name], ours[mine], 4, why, timed=True)
-    why = "neither link lengths nor the gain of the null term are printed, and the iterations depend on both"
+    why = (
+        "the number of iterations depends on the link lengths and on the gain in the null space, which are not printed"
+    )
     ratio = report["time_ratio_jacobian_over_combined"]
     quotient = printed["jacobian"] / printed["combined"]
     yield Printed("cts", "Table 6", "times of both, ratio", quotient, ratio, 2, why, timed=True)

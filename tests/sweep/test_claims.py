@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from scripts.papers.reproduced import read_tables
 from tests.sweep.results import rows_of
@@ -44,3 +46,138 @@ def test_pages_have_the_number_of_reproduced_results() -> None:
     claims = re.search(r"are reproduced\. (\d+) differ", page)
     assert claims is not None
     assert int(claims[1]) == verdicts.count("no")
+
+
+CAPTION = "results/{}.caption.txt"
+
+
+def words(name: str) -> str:
+    """The text of a file with single spaces."""
+    return " ".join((ROOT / name).read_text(encoding="utf-8").split())
+
+
+def table(name: str) -> list[dict[str, str]]:
+    with (ROOT / "results" / "benchmark" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def claimed(page: str, pattern: str) -> list[float]:
+    """The numbers that the groups of a pattern find on a page."""
+    match = re.search(pattern, words(page))
+    assert match is not None, f"{page} does not say: {pattern}"
+    return [float(group) for group in match.groups()]
+
+
+def two_digits(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def test_the_page_of_bounds_has_the_gaps_and_times_of_the_rows() -> None:
+    rows = [row for row in rows_of(ROOT / "results" / "sweeps" / "global_plans.jsonl").values() if row["passed"]]
+    for redundant, kinds in (("one", ["panda", "ur5"]), ("two", ["planar"])):
+        own = [row for row in rows if row["kind"] in kinds]
+        counts = [sum(row["kind"] == kind for row in own) for kind in kinds]
+        gaps = [round(100 * (row["cost"] / row["bound"] - 1), 1) for row in own]
+        times = [round(row["seconds"], 1) for row in own]
+        tasks = " .*?".join([r"(\d+) of a"] * len(kinds))
+        pattern = rf"\| {redundant} \| {tasks}[^|]*" + r"\| ([\d.]+) to ([\d.]+) % \| ([\d.]+) to ([\d.]+) s"
+        assert claimed("docs/theory/bound.md", pattern) == [*counts, min(gaps), max(gaps), min(times), max(times)]
+        largest = rf"exceeded the bound by .*?at most ([\d.]+) % with {redundant}"
+        assert claimed("docs/tutorials/waypoints.md", largest) == [max(gaps)]
+
+
+def test_the_page_of_waypoints_has_the_lengths_and_gaps_of_the_rows() -> None:
+    rows = rows_of(ROOT / "results" / "sweeps" / "redundancy.jsonl").values()
+    *close, middle, largest = sorted(100 * ((row["rad"] + row["m"]) / row["bound"] - 1) for row in rows)
+    pattern = r"exceeds the bound by at most ([\d.]+) %, in `fetch square` .*? by ([\d.]+) %, and in .*? by (\d+) %"
+    gaps = [round(max(close), 1), round(middle, 1), round(largest)]
+    assert claimed("docs/tutorials/waypoints.md", pattern) == gaps
+    *usual, slowest = sorted(round(row["seconds"]) for row in rows)
+    times = claimed("docs/tutorials/waypoints.md", r"takes (\d+) to (\d+) s of processor time, .*? (\d+) s")
+    assert times == [usual[0], usual[-1], slowest]
+    for row in rows:
+        name = row["kind"].replace("__", " ")
+        extra = r" and ([\d.]+) m" if row["m"] > 0.0 else ""
+        *lengths, bound = claimed(
+            "docs/tutorials/waypoints.md", rf"\| {name}[^|]*\|[^|]*\| ([\d.]+){extra} \| ([\d.]+)[^|]*\|"
+        )
+        numbers = [float(f"{value:.4g}") for value in (row["rad"], row["m"], row["bound"]) if value]
+        assert [*lengths, bound] == numbers, name
+
+
+@pytest.mark.parametrize(
+    ("line", "tool"),
+    [
+        (r"`controller\.step`", "controller, Gauss-Newton"),
+        (r"`controller\.step`, exact Hessian", "controller, exact"),
+        (r"the same as the first in C, from `to_c`", "controller in C"),
+        (r"`prepared\.solve`", "solve"),
+        (r"fatrop, by `prepare\(solver=\"fatrop\"\)`", "fatrop"),
+        ("acados, exact Hessian", "acados, exact"),
+        ("acados, Gauss-Newton", "acados, Gauss-Newton"),
+        (r"aligator, C\+\+", "aligator"),
+    ],
+)
+def test_the_table_of_latencies_is_that_of_the_last_run(line: str, tool: str) -> None:
+    rows = [row for row in table("controllers") if row["tool"] == tool]
+    assert len(rows) == 4
+    cells = r" \| ".join([r"([\d.]+) / ([\d.]+)(?: \(\d+ %\))?"] * len(rows))
+    numbers = [two_digits(float(row[name])) for row in rows for name in ("median_ms", "worst_ms")]
+    page = claimed("docs/tutorials/replanning.md", rf"\| {line} \| {cells} \|")
+    assert [two_digits(value) for value in page] == numbers
+
+
+def test_the_slowest_control_steps_are_those_of_the_last_long_run() -> None:
+    worst = [two_digits(float(row["worst_ms"])) for row in table("controllers_long")]
+    pattern = (
+        r"cart-pole takes ([\d.]+) ms in Python and ([\d.]+) ms in C, that of the Panda ([\d.]+) ms and ([\d.]+) ms"
+    )
+    assert claimed("docs/tutorials/replanning.md", pattern) == worst
+
+
+def test_the_time_of_all_distances_is_that_of_the_last_run() -> None:
+    (row,) = [
+        row
+        for row in table("distances")
+        if row["shapes"] == "arm" and row["function"].endswith("wrenches") and row["by"] == "interpreted"
+    ]
+    page = claimed("docs/tutorials/clearance.md", r"For (\d+) pairs of bodies.*? it takes about (\d+) μs")
+    assert page == [float(row["pairs"]), float(f"{float(row['us']):.1g}")]
+
+
+def test_the_times_of_schedules_are_those_of_the_last_run() -> None:
+    rows = {(row["limits"], row["tool"].partition(",")[0]): row for row in table("schedules_peers")}
+    median = {key: round(float(row["median_ms"])) for key, row in rows.items()}
+    page = claimed("docs/coming_from.md", r"median time is (\d+) ms for `schedule` .*?, (\d+) ms for toppra")
+    assert page == [median["acceleration", "selfmotion"], median["acceleration", "toppra"]]
+    page = claimed("docs/coming_from.md", r"`schedule` takes (\d+) ms in the median and (\d+) ms at most")
+    assert page == [median["jerk", "selfmotion"], round(float(rows["jerk", "selfmotion"]["worst_ms"]))]
+
+
+def test_pages_repeat_the_captions_of_their_figures() -> None:
+    claims = {  # page and pattern, caption and pattern
+        (
+            "docs/tutorials/satellite.md",
+            r"is (\d+) deg/s by the pseudo-inverse and (\d+) deg/s in the optimal motion",
+        ): ("free_floating/fig07_12_joint_velocity", r"(\d+) deg/s by the pseudo-inverse, (\d+) deg/s in the optimum"),
+        ("docs/gallery/pick_and_place.md", r"joint 2 needs (\d+) % of its torque limit"): (
+            "gallery/pick_and_place",
+            r"joint 2 needs (\d+) % of its torque limit",
+        ),
+        ("docs/gallery/steps.md", r"a static walk takes (\d+) s, a dynamic one (\d+) s"): (
+            "gallery/talos",
+            r"TALOS needs (?=[\d.]+ s instead of ([\d.]+) s)([\d.]+) s",
+        ),
+    }
+    for (page, pattern), (figure, caption) in claims.items():
+        assert claimed(page, pattern) == claimed(CAPTION.format(figure), caption), page
+    least, most = claimed(CAPTION.format("gallery/ur5"), r"([\d.]+) to ([\d.]+) by the pseudo-inverse from the 4")
+    saved, more = claimed(
+        CAPTION.format("gallery/ur5"),
+        r"costs (\d+) % less than the pseudo-inverse.*costs ([\d.]+) % more than the plan",
+    )
+    shares = claimed(
+        "docs/index.md", r"it costs ([\d.]+) times as much as the plan; .* it costs ([\d.]+) times as much"
+    )
+    assert shares == [round(1 / (1 - saved / 100), 1), round(most / least, 1)]
+    assert more == 0.0

@@ -79,8 +79,9 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return the result as a table row: ``COLUMNS``, entries of the task as ``task.NAME``, of its value as
-        ``result.NAME``.
+        """Return the result as a table row.
+
+        It contains ``COLUMNS``, the entries of the task as ``task.NAME``, and those of its value as ``result.NAME``.
 
         Longer entries of a task are given as JSON.
         """

@@ -242,7 +242,7 @@ def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[F
 
 
 def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
-    """Return a text that states the number of invalid values and where the first one (in sample k) is."""
+    """Return a text that states the number of invalid values, and the time and line of the first one, in sample k."""
     count = int(invalid.sum())
     text = f"{count} values are not numbers, the first" if count > 1 else "a value is not a number,"
     return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"

@@ -136,7 +136,7 @@ class TimingProblem:
 
 @dataclass(frozen=True, eq=False)
 class FastestMotion:
-    """FastestMotion motion along a path, with its minimum-time problem and solution.
+    """Fastest motion along a path, with its minimum-time problem and solution.
 
     Attributes:
         schedule: Motion as from ocp.motion.schedule, without a list of dips.

@@ -389,7 +389,7 @@ def _declare_in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _declare_closure(motion: _Motion) -> Any:
-    """Declare and return a constant velocity error of a task whose path is closed, so that the joints return exactly.
+    """Declare a constant velocity error of a task on a closed path, so that the joints can return exactly.
 
     If the joints return, the task returns as well. Both conditions differ by the error of the discretisation alone.
     """

@@ -135,7 +135,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate IK solutions that result from one opening of the kinematic loop.
+    """Candidate IK solutions that one choice of the joint at which the closed kinematic loop is opened yields.
 
     Attributes:
         pose: Index of the pose of each candidate. Shape (K,).

@@ -227,7 +227,7 @@ def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return the goal at the start configuration of the next task's plan, or unchanged if that misses the goal."""
+    """Return a goal at the start configuration of the next task's plan; if that is not at the goal, return the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (
         goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START

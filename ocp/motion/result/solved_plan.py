@@ -265,7 +265,7 @@ class SolvedPlan(Plan):
         return [part.begin for part in self.parts]
 
     def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a quantity at times (M,), a function of a part of the plan and fractions of the horizon."""
+        """Evaluate a function of a part of the plan and of fractions of the horizon of this part, at times (M,)."""
         return evaluate_parts(
             self._begins,
             times,

@@ -187,7 +187,7 @@ def dead_end(
 
 
 class _Propagation:
-    """Configurations that are propagated from one time sample to the next, one for each reachable manifold chart.
+    """Configurations propagated from time sample to time sample, one for each chart that can be reached.
 
     Attributes:
         layers: Charts of each sample, no wider than steps, including those in collision.

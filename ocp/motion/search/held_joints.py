@@ -194,7 +194,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return a planning request whose joints at rest are moved so that they do not cause the collision in an error.
+    """Return a planning request whose joints at rest are moved out of the collision that an error reports.
 
     Args:
         whole: Request before joints were held.

@@ -292,7 +292,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best path over all sections and the best on each section, by rising cost; the cost bound is 0."""
+        """Return the best paths over all sections and on each one, by increasing cost, and the cost bound 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

@@ -424,7 +424,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
-        """Return the combinations of task equations whose integral vanishes if the joints return. Shape (size, k).
+        """Return the combinations of task equations whose integral vanishes over a cyclic motion. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
         fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre

@@ -88,7 +88,7 @@ class Pinned:
 
 @dataclass(frozen=True)
 class Following:
-    """Rule that the zero moment point follows a reference point, given as a function of CasADi time (s) to (x, y), m.
+    """Rule that the zero moment point follows a reference (x, y), m: a function of the CasADi symbol of time, s.
 
     This holds in the directions in which motion moves the point, as for Pinned.
     """

@@ -62,7 +62,7 @@ def _legs(ax: Any, degrees: float, length: float) -> None:
 
 def _shapes(folder: Path) -> None:
     sizes = (30, 25, 20, 15)
-    title = "Figures 3, 5 and 6: the shape factor, the remaining length and the angle make the curve"
+    title = "Figures 3, 5 and 6: shape factor, remaining length and angle determine the curve"
     with sheet(folder / "fig03_06_shapes.png", (1, 3), (8.2, 3.7), title=title) as (_, axes):
         cases = (
             ("α = 30 mm, 90° (figure 3)", 90.0, 30.0),
@@ -78,7 +78,9 @@ def _shapes(folder: Path) -> None:
             ax.set_title(title)
         axes[0, 0].set_ylabel("y, mm")
         axes[0, 0].legend(loc="upper left")
-    title = "Figures 4 and 7: equal shape factors make similar curves; the greater the factor, the closer to the corner"
+    title = (
+        "Figures 4 and 7: equal shape factors yield similar curves; the greater the factor, the closer to the corner"
+    )
     with sheet(folder / "fig04_07_similarity.png", (1, 2), (7.8, 4.0), title=title) as (_, axes):
         left, right = axes[0]
         _legs(left, 90, 33)
@@ -209,7 +211,7 @@ def _joints(folder: Path, results: Results) -> None:
         ),
         (
             "fig17_joint_rates.png",
-            "Figure 17: joint rates are smooth, their derivatives bend where blends begin and end",
+            "Figure 17: joint rates are smooth, their derivatives have kinks where blends begin and end",
             (velocity, acceleration),
             ("velocity, deg/s", "acceleration, deg/s²"),
             ("quill, mm/s", "quill, mm/s²"),
@@ -248,9 +250,9 @@ def _line_speed(folder: Path, results: Results) -> None:
         f"mapping within {mapped:.2g} mm/s"
     }
     note = (
-        "Differences of positions 2 ms apart; shaded: the blends. Right: speed less the planned one; the default "
-        "mapping leaves the chord against the arc alone, the paper's drifts, which shows as one step of "
-        f"{exits[0]:+.1f} and {exits[1]:+.1f} mm/s (beyond the axis) where its blends end."
+        "Differences of positions 2 ms apart; shaded: the blends. Right: speed minus planned speed. The default "
+        "mapping leaves only the difference between chord and arc. The paper's mapping drifts, which appears as one "
+        f"step of {exits[0]:+.1f} and {exits[1]:+.1f} mm/s (beyond the axis) where its blends end."
     )
     with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.8), note, **by_name) as (_, axes):
         left, centre, right = axes[0]
@@ -260,7 +262,7 @@ def _line_speed(folder: Path, results: Results) -> None:
         centre.set(xlabel=TIME, ylabel="line acceleration, m/s²", title="line acceleration")
         for (mapping, name), color, dash in zip(MAPPINGS.items(), ("orange", "blue"), DASHES, strict=False):
             right.plot(results.speed_error_times, results.speed_errors[mapping], COLORS[color], ls=dash, label=name)
-        right.set(xlabel=TIME, ylabel="line speed error, mm/s", ylim=(-0.95, 0.2), title="speed less the planned one")
+        right.set(xlabel=TIME, ylabel="line speed error, mm/s", ylim=(-0.95, 0.2), title="speed minus planned speed")
         right.legend(loc="lower left")
         for ax in axes[0]:
             _mark(ax, edges)
@@ -277,7 +279,7 @@ def _within(results: Results, edges: Array, mapping: str) -> Array:
 
 def _mapping(folder: Path, results: Results) -> None:
     note = "90° corner at 1000 mm/s; cubic with λ = 3, quintic with λ = 1.5. Below 1e-9 the curves show rounding."
-    title = "The paper's mapping drifts the more the smaller the blend; Gauss-Legendre and Newton hardly do"
+    title = "The smaller the blend, the more the paper's mapping drifts; Gauss-Legendre and Newton hardly do"
     by_name: dict[str, Any] = {"title": title, "sharex": True, "sharey": "row"}
     with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 6.1), note, **by_name) as (figure, axes):
         for row, key, label in (
@@ -329,9 +331,9 @@ def _limits(folder: Path, results: Results) -> None:
         "Thick: the schedule; thin: by optimal control. Its jerk is held over intervals, which costs up to 1 %. "
         f"Centripetal acceleration at most "
         f"{CENTRIPETAL:g} m/s². Joint limits (chosen) of shoulder, elbow, quill, wrist: {joint_limits()}. "
-        "The cubic's curvature jumps, so that it can keep no joint jerk limit."
+        "The curvature of the cubic blend jumps, so that no joint jerk limit can be satisfied."
     )
-    title = "Which limits are kept decides the time: blends are slowed down where curvature or joints ask for it"
+    title = "The limits determine the duration: curvature and joints require a lower speed in the blends"
     with sheet(folder / "limits.png", (2, 2), (9.0, 5.9), note, title=title, sharey="row") as (_, axes):
         for (upper, lower), kind in zip(axes.T, ("cubic", "quintic"), strict=True):
             mine = {name: plan for name, plan in results.plans.items() if name.startswith(kind)}
@@ -409,4 +411,4 @@ def _animation(folder: Path, results: Results) -> None:
 
     artists = [picture, arm, *(dot for dot, _ in moving), title]
     gif(folder / "motion.gif", frames(), seconds=FRAME, moving=artists)
-    caption(folder / "motion.gif", "A SCARA runs the path with its two blends, in real time", NOTE)
+    caption(folder / "motion.gif", "A SCARA arm follows the path with its two blends, in real time", NOTE)

@@ -87,7 +87,7 @@ def _joints(folder: Path, results: Results) -> None:
 def _iterations(path: Path, results: Results) -> None:
     z = results.targets[:, 2] / INCH
     note = f"The closed form has no iterations. {NOTE}"
-    title = "Figure 8: iterations that a target takes, of each law"
+    title = "Figure 8: number of iterations for each target, by each law"
     with sheet(path, (1, 2), (8.2, 3.9), note, title=title, sharey=True, xlabel="target z, in") as (_, axes):
         for ax, name in zip(axes[0], ("i1", "i2"), strict=True):
             for (method, gain, label), color, dash in zip(ITERATIONS, METHOD_COLORS, DASHES, strict=False):
@@ -106,7 +106,7 @@ def _rig(path: Path, results: Results) -> None:
     lines = skeleton(results.rig, table.joints[rows])
     turn = float(np.degrees(np.ptp(table.joints[:, 5])))
     by_name: dict[str, Any] = {
-        "title": f"Figure 6: over the sweep the roll turns by {turn:.0f}°, and the goose-neck goes round the middle",
+        "title": f"Figure 6: over the sweep the roll turns by {turn:.0f}°, and the goose-neck moves around the centre",
         "width_ratios": (5.5, 1),
         "sharey": True,
     }
@@ -131,11 +131,11 @@ def _release(folder: Path, results: Results) -> None:
     result = results.release
     around, closest = _Scene(results), int(result.clearance.argmin())
     note = (
-        "The rig and the wing as capsules and a box; earlier postures pale; green: the path of the goose-neck's end. "
-        f"Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. {NOTE}"
+        "The rig and the wing as capsules and a box; earlier configurations are pale; green: the path of the end of "
+        f"the goose-neck. Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. {NOTE}"
     )
     title = (
-        f"The rig takes the store along its free fall and comes no nearer to the wing or a wall than "
+        f"The rig moves the store along its free fall and stays away from the wing and the walls by at least "
         f"{result.clearance[closest] / INCH:.1f} in"
     )
     with sheet(folder / "release.png", (2, 4), (9.6, 5.4), note, title=title) as (figure, axes):
@@ -219,7 +219,7 @@ def _animate(path: Path, results: Results, around: _Scene) -> None:
         ax = axes[0, 0]
         ax.set_axis_off()
         image = ax.imshow(around.picture((0,), (500, 400)))
-        ax.set_title("The rig takes the store along its fall from the wing")
+        ax.set_title("The rig moves the store along its fall from the wing")
         title = figure.suptitle(" ", fontsize=9)  # room for the time
         add_note(figure, "Store, ejectors, air, walls, wing and link lengths chosen")
 

@@ -134,9 +134,7 @@ def draw_plan(path: Path, result: RollPlan) -> None:
     )
     names = ("roll", "rate", "index", "clearance")
     labels = ("roll $q_6$, rad", "roll rate, rad/s", "index $I_1$", "clearance of the rig, m")
-    title = (
-        "Planned as a whole the roll keeps its rate within the limit and the rig clear; each target by itself does not"
-    )
+    title = "Planned as a whole, the roll satisfies the limits of rate and clearance; target by target, it does not"
     with sheet(path, (2, 2), (8.2, 5.3), note, title=title, sharex=True, xlabel="time, s") as (_, axes):
         for ax, name, label in zip(axes.flat, names, labels, strict=True):
             ax.plot(

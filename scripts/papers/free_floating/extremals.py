@@ -31,7 +31,7 @@ SAME_RATES = 1e-2  # and in joint rates, relative to the largest, are one
 GRID = 2001  # times that peaks are read from
 
 CONFIRMED = "extremal"
-NOT_GLOBAL = "The best of what these first guesses led to; a better extremal may exist"
+NOT_GLOBAL = "These are the best results from the initial guesses; a better extremal may exist"
 DIRECT_ONLY = "direct only: not confirmed by the minimum principle"
 
 

@@ -55,8 +55,8 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
     motions, note = (local, optimal), NOTE
     costs = [float(np.trapezoid((m.joint_rates**2).sum(axis=1) / 2, m.t)) for m in motions]
     title = (
-        f"On the same line the optimum needs {100 * costs[1] / costs[0]:.0f} % of the pseudo-inverse's integral of "
-        "half the squared joint rates"
+        f"On the same line the optimum costs {100 * costs[1] / costs[0]:.0f} % of the pseudo-inverse (integral of half "
+        "the squared joint rates)"
     )
     by_name: dict[str, Any] = {"title": title, "xlabel": "x, m", "sharey": True}
     with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.6), note, **by_name) as (figure, axes):
@@ -67,7 +67,7 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
         axes[0, 0].legend(loc="lower right")
         time_bar(figure, axes, local.t[-1], fraction=0.04, pad=0.02)
     turn = np.degrees(np.ptp(optimal.base[:, 2]))
-    title = f"The tip runs its line while the free base turns by {turn:.0f}°: the optimum"
+    title = f"Optimum: the tip follows its line, the free base turns by {turn:.0f}°"
     with sheet(folder / "optimal_motion.png", (1, 1), (5.4, 5.8), note, title=title) as (figure, axes):
         _strobe(axes[0, 0], machine, optimal)
         axes[0, 0].set(xlabel="x, m", ylabel="y, m")
@@ -90,14 +90,14 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
     )
     title = f"The base turns by up to {turns[0]:.0f}° by the pseudo-inverse, by up to {turns[1]:.0f}° in the optimum"
     _pair(folder / "fig04_09_base_pose.png", motions, (4, 9), 4.8, pose, title)
-    title = "The base is jerked where the pseudo-inverse comes near a singularity; the optimum moves it gently"
+    title = "Near a singularity the base moves abruptly by the pseudo-inverse, and smoothly in the optimum"
     _pair(folder / "fig06_11_base_velocity.png", motions, (6, 11), 4.8, velocity, title)
-    title = "The joints turn fast by the pseudo-inverse near its singularity, evenly in the optimum"
+    title = "Near a singularity the joints turn fast by the pseudo-inverse, and evenly in the optimum"
     _pair(folder / "fig05_10_joint_angles.png", motions, (5, 10), 3.5, [angles], title)
     title = f"The fastest joint: {peaks[0]:.0f} deg/s by the pseudo-inverse, {peaks[1]:.0f} deg/s in the optimum"
     _pair(folder / "fig07_12_joint_velocity.png", motions, (7, 12), 3.5, [rates], title)
     least = int(local.manipulability.argmin())
-    title = f"The pseudo-inverse nearly comes to a singularity at {local.t[least]:.2f} s; the optimum keeps away"
+    title = f"The pseudo-inverse nearly reaches a singularity at {local.t[least]:.2f} s; the optimum avoids it"
     with sheet(folder / "fig13_manipulability.png", (1, 1), (6.3, 3.6), note, title=title) as (_, axes):
         ax = axes[0, 0]
         for motion, name, color, dash in zip(motions, NAMES, ("orange", "blue"), DASHES[1::-1], strict=True):
@@ -141,7 +141,9 @@ def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
     note = f"{ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
     passed = [t for t in trials if t.audit]
     false = sorted((t for t in trials if t.verdict == FALSE), key=lambda t: t.cost)
-    title = f"Of {len(trials)} plans that the solver calls optimal {len(false)} are none: the audit finds their jumps"
+    title = (
+        f"Of {len(trials)} plans that the solver reports as optimal, {len(false)} are not: the audit finds their jumps"
+    )
     with sheet(folder / "false_optima.png", (1, 2), (8.2, 4.0), note, title=title) as (_, axes):
         left, right = axes[0]
         kinds = {

@@ -50,8 +50,8 @@ CAVEATS = {
         "horizons has the paper's peaks either, see extremals.csv",
     },
     "accelerations": {
-        "pseudo-inverse": "not reproducible: the velocity is smooth, so its derivative is 0 at a peak inside the "
-        "motion, and no larger than the last column anywhere",
+        "pseudo-inverse": "not reproducible: the velocity is smooth, so that its derivative is 0 at a peak inside the "
+        "motion",
         "optimum": "not comparable: the paper's horizon is not printed, ours is 5 s",
     },
 }
