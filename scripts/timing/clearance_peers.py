@@ -4,7 +4,7 @@ Let s(t) be a polynomial on [-1, 1] and q = q0 + 2 atan(s) the joints. The point
 functions of t, and a separating plane that is affine in t certifies that two bodies stay apart if, for each corner, a
 polynomial in t is nonnegative (Amice, Werner, Tedrake 2024, Certifying Bimanual RRT Motion Plans in a Second). One
 semidefinite program for each pair of bodies, solved by Clarabel, finds it. The paper's own program was never released;
-this one is written anew. C-IRIS (Dai, Amice, Werner, Zhang, Tedrake 2023) certifies a polytope of joint positions: here
+this one is written anew. C-IRIS (Amice, Dai, Werner, Zhang, Tedrake 2022) certifies a polytope of joint positions: here
 the tube around a straight motion in s, by ``CspaceFreePolytope`` of Drake. All bodies are boxes, the same for all.
 """
 
