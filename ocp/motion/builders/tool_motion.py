@@ -29,7 +29,7 @@ from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.targets import required_nodes
-from ocp.motion.tasks.tip_task import TipTask, is_holonomic
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -328,7 +328,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
             derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.setup.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack + error, free, required, derivatives)
-        placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
+        placed = np.concatenate([part.is_holonomic for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
         problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
@@ -443,7 +443,7 @@ def _declare_tasks(
             change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
             at.append(targets)
             along.append(problem.signal(f"target rates{suffix}", lambda t: change_at(stretch.begin + pace * t)))
-        gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
+        gains = equations.by_row(lambda task: float(task.gain))
         gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{suffix}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
         actuation = motion.setup.actuation

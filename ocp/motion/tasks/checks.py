@@ -16,7 +16,7 @@ from models import Joint, Machine
 from models.checks import Array, warn_of_degrees
 from ocp.errors import ProblemError, format_distinct, require
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_rows, target_size
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask
 
 
 @dataclass(frozen=True)
@@ -163,11 +163,11 @@ def checked_tasks(
             gap = float(np.abs(residual).max())
             if gap > part.task.start_gap:
                 words = (
-                    f"at the start joints {joints.tolist()} the frame of {_frame(part)!r} is {gap:.3g} (m or rad) away "
+                    f"at the start joints {joints.tolist()} the frame of {part.name!r} is {gap:.3g} (m or rad) away "
                     f"from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
                     "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
                 )
-                raise ProblemError(words, name=_frame(part), value=gap, limit=part.task.start_gap, time=0.0)
+                raise ProblemError(words, name=part.name, value=gap, limit=part.task.start_gap, time=0.0)
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
@@ -186,7 +186,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
     """
     machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
-    targets = ca.SX.sym("targets", sum(target_size(value.task) for value in equations.bound))
+    targets = ca.SX.sym("targets", equations.target_size)
     parts = [equations.jacobian(b, q), equations.right(b, q, targets)]
     parts += [machine.base_rate(b, q, u), equations.cone_cosines(b, q, targets)]
     function = ca.Function("requirements", [b, q, u, targets], parts, {"cse": True})
@@ -213,11 +213,6 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
     return list(range(equations.size))
 
 
-def _frame(part: BoundTask) -> str:
-    """Return the name of the link whose frame a task moves."""
-    return part.task.link or part.tip.robot.tip_link
-
-
 def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
     """Sample the targets of all tasks at `count` equidistant times from 0 to the horizon; return times and samples."""
     times = np.linspace(0.0, horizon, count)
@@ -228,7 +223,7 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
     """Raise ProblemError if a target orientation is not a rotation matrix at one of the times."""
     for part, targets in equations.by_task(values):
         if part.task.orientation is not None:
-            rotations = targets[target_rows(part.task)["orientation"][0]].T.reshape(-1, 3, 3)
+            rotations = targets[part.target_rows["orientation"][0]].T.reshape(-1, 3, 3)
             invalid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
             invalid |= np.linalg.det(rotations) < 0
             if invalid.any():
@@ -254,9 +249,9 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
     for part, targets in equations.by_task(values):
         task = part.task
         if task.is_pose:
-            gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], _rate_rows(task))).max()
+            gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], part.rate_rows)).max()
         else:
-            holonomic = is_holonomic(part)
+            holonomic = part.is_holonomic
             by_row, zeros = dict(zip(task.chosen, targets, strict=True)), np.zeros(CHECKS.closure_samples)
             angular = [by_row.get(row, zeros) for row in ANGULAR]
             linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and holonomic[i]]
@@ -266,10 +261,10 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
             gap = max(float(np.abs(displacement).max(initial=0.0)), rotation)
         if gap > CHECKS.closed:
             words = (
-                f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
+                f"cyclic: the task of {part.name!r} is not closed: it ends {gap:.3g} (m or rad) "
                 "from where it began, and the joints cannot return; close the path"
             )
-            raise ProblemError(words, name=_frame(part), value=gap, limit=CHECKS.closed)
+            raise ProblemError(words, name=part.name, value=gap, limit=CHECKS.closed)
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
@@ -277,10 +272,10 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = (
-                f"the task of {_frame(part)!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
+                f"the task of {part.name!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
                 "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
             )
-            raise ProblemError(words, name=_frame(part), value=velocity, limit=CHECKS.still, time=float(time))
+            raise ProblemError(words, name=part.name, value=velocity, limit=CHECKS.still, time=float(time))
 
 
 def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
@@ -291,7 +286,7 @@ def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
 def _moving_tasks(equations: TaskEquations, time: float) -> Iterator[tuple[BoundTask, Array]]:
     """Yield the tasks that prescribe motion at a time, and the velocities that they prescribe, m/s and rad/s."""
     for part, values in equations.by_task(np.array(equations.target_function()(time)).ravel()):
-        velocity = values[_rate_rows(part.task)] if part.task.is_pose else values
+        velocity = values[part.rate_rows] if part.task.is_pose else values
         if np.linalg.norm(velocity) > CHECKS.still:
             yield part, velocity
 
@@ -309,10 +304,10 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         worst = int(far.argmax())
         if far[worst] > reach:
             words = (
-                f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
+                f"the task of {part.name!r} leads {far[worst]:.4g} m away from the first joint at "
                 f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             )
-            raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
+            raise ProblemError(words, name=part.name, value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
@@ -338,11 +333,11 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
             worst = int(speeds.argmax())
             if speeds[worst] > limit * (1 + CHECKS.closed):
                 words = (
-                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {speeds[worst]:.4g} {unit}, "
+                    f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, "
                     f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
                 )
                 details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
-                raise ProblemError(words, name=_frame(part), **details)
+                raise ProblemError(words, name=part.name, **details)
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
@@ -388,11 +383,6 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
     slides = [joint for joint in chain[: first + 1] if joint.kind == "prismatic"]
     slide_length = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
     return shoulder, slide_length + _chain_length(machine, chain[first + 1 :])
-
-
-def _rate_rows(task: TipTask) -> list[int]:
-    """Return the indices of the velocities and angular velocities among the target values of a pose task."""
-    return [row for _, rates in target_rows(task).values() for row in range(rates.start, rates.stop)]
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:

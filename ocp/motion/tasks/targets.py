@@ -14,7 +14,7 @@ from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.curves import lagrange
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.tip_task import TipTask, target_rows, target_size
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE
 
@@ -169,11 +169,11 @@ def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
     The velocity of an orientation or of a direction is an angular velocity.
     """
     poses, rates, at = list[int](), list[slice](), 0
-    for task in (part.task for part in equations.bound):
-        for pose, rate in target_rows(task).values():
+    for part in equations.bound:
+        for pose, rate in part.target_rows.values():
             poses += range(at + pose.start, at + pose.stop)
             rates.append(slice(at + rate.start, at + rate.stop))
-        at += target_size(task)
+        at += part.target_size
     return poses, rates
 
 

@@ -429,8 +429,7 @@ def _error_of_tips(
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""
     progress = audit.states["path"][:, 0] if along_parameter else audit.t
     errors = np.abs(task_errors(machine, tasks, progress, audit.states["joints"])).max(axis=0)
-    parts = bind(machine, tasks).bound
-    gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
+    gaps = bind(machine, tasks).by_row(lambda task: task.start_gap)
     if (errors > np.maximum(gaps, POSE_TOLERANCE)).any():
         words = f"a tip deviates from its task by {errors.max():.2g} (m or rad)"
         return SolveError(words, name="tip", value=errors.max())
