@@ -21,37 +21,24 @@ from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Settings of the checks of tip tasks: numbers of samples and tolerances.
+    """Settings of the checks of tip tasks: numbers of samples and tolerances."""
 
-    Attributes:
-        track_samples: Number of samples of a track, a target over time.
-        closure_samples: Number of samples of a closed track: odd, for Simpson's rule.
-        closed: Largest gap of a closed path, m and rad.
-        ignorable: Relative change of the required joint rates below which a joint position counts as without effect.
-        ignorable_samples: Number of random configurations in which that is evaluated.
-        rounding: Tolerance of a joint limit, relative to the range between the limits; without one, to the limit, and
-            absolute (rad or m) for limits below 1.
-        still: Largest task velocity where the joints are to be at rest, m/s and rad/s.
-    """
-
-    track_samples: int = 201
-    closure_samples: int = 2001
-    closed: float = 1e-6
+    track_samples: int = 201  # of a track, a target over time
+    closure_samples: int = 2001  # of a closed track: odd, for Simpson's rule
+    closed: float = 1e-6  # largest gap of a closed path, m and rad
+    # relative change of the required joint rates below which a joint position counts as without effect
     ignorable: float = 1e-9
-    ignorable_samples: int = 4
+    ignorable_samples: int = 4  # number of random configurations in which that is evaluated
+    # tolerance of a joint limit, relative to the range between the limits; without one, to the limit (at least 1)
     rounding: float = 1e-9
-    still: float = 1e-6
+    still: float = 1e-6  # largest task velocity where the joints are to be at rest, m/s and rad/s
 
 
 CHECKS = CheckSettings()
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """Return the horizon (duration) of a motion, s; if `horizon` is None, this is the time at which the last task ends.
-
-    Raises:
-        ProblemError: The horizon is not positive, or it is None and no task has a duration.
-    """
+    """Return the horizon of a motion, s, by default the end of the last task; raise ProblemError if there is none."""
     if horizon is None:
         ends = [task.end for task in tasks if task.duration is not None]
         if not ends:
@@ -64,13 +51,10 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
     """Check the joint positions (joint_size,) and the base configuration (base_size,) of a start, and return both.
 
-    The base is by default the machine's base_home().
+    The base is by default the machine's base_home(). Warns of angles that look like degrees.
 
     Raises:
         ProblemError: Wrong sizes, a value that is not finite, or a quaternion that is not of unit length.
-
-    Warns:
-        ModelWarning: Angles that look like degrees.
     """
     if joints is None:
         words = "start is missing; give joint positions: inverse_kinematics(machine, task) finds some for a pose"
@@ -88,16 +72,10 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Clip joint positions or velocities (n,) to their limits, which rounding errors alone may have exceeded.
-
-    Args:
-        joints, lower, upper: Joint positions, or velocities, nan where free, and their limits. Shape (n,).
-        label: Name of the values in errors, for example "end_joints".
-        names: Names of the joints.
-        hint: End of the error message: what to do.
+    """Clip joint positions or velocities (n,), nan where free, to limits that rounding errors alone may have exceeded.
 
     Raises:
-        ProblemError: A joint is outside its limits by more than rounding.
+        ProblemError: A joint is outside its limits; `label` names the values, and `hint` says what to do.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
         size = high - low if np.isfinite(high - low) else max([1.0, *(abs(x) for x in (low, high) if np.isfinite(x))])
@@ -179,10 +157,10 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints' positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
+    """Return which joints' positions affect neither the required joint rates nor the base motion. Shape (n,).
 
-    Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
-    and the cones of tool axes do not depend on such a joint position.
+    That is evaluated in random configurations: the rates that do the tasks, the null space, the base motion and the
+    cones of tool axes do not depend on such a joint position.
     """
     machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
@@ -241,10 +219,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target of a task does not return to its start, as a cyclic motion requires.
-
-    Poses are checked by their targets, velocities by their integrals.
-    """
+    """Raise ProblemError if the target of a task (of a velocity: its integral) does not return to its start."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in equations.by_task(values):
         task = part.task
@@ -311,14 +286,9 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than the joint rate limits permit the tip to move in any configuration.
+    """Raise ProblemError if a task is faster than rate limits (n,) permit the tip of a fixed arm to move anywhere.
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
-
-    Args:
-        equations: Equations of the tasks; those on a floating base are not checked.
-        rate_limits: Limits of the joint rates, rad/s or m/s. Shape (n,).
-        begin, end: Time interval of the tasks, s.
     """
     times = np.linspace(begin, end, CHECKS.track_samples)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
@@ -386,10 +356,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that results from a sampled angular velocity (3, samples) in world.
-
-    A fourth-order Magnus expansion integrates two steps at a time.
-    """
+    """Return the angle, rad, of the rotation by sampled angular velocities (3, samples) in world (Magnus expansion)."""
     first, middle, last = velocity[:, :-2:2], velocity[:, 1:-1:2], velocity[:, 2::2]
     vectors = step / 3 * (first + 4 * middle + last) + step**2 / 3 * np.cross(last, first, axis=0)
     turns = scipy.spatial.transform.Rotation.from_rotvec(vectors.T)
@@ -399,14 +366,9 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
     """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for as many joints as tasks fix there.
 
-    A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
-    rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip
-    most are left free.
-
-    Args:
-        equations: Equations of the tasks.
-        base, joints: Configuration near that end.
-        rows: Which rows of the tasks come to rest by themselves; all if None. Shape (size,).
+    A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
+    joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task
+    equations that come to rest by themselves; all if None.
     """
     rest = np.zeros(len(joints))
     jacobian = np.array(ca.DM(equations.jacobian(ca.DM(base), joints)))

@@ -59,10 +59,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints that move neither the frame nor the reference frame of any task. Shape (joint_size,).
-
-        On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
-        """
+        """Mask of the joints, (n,), that move no frame or reference of a task; none if joints move a base or balance."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
@@ -71,11 +68,8 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text, for example "rad/s, m/s" for the velocity residual.
-
-        Args:
-            pose, velocity: Time units of the rows of pose and of velocity tasks: "" for `error`, "/s^2" for
-                `acceleration`.
+        """Return the units of the task equations, such as "rad/s, m/s", for given time units of pose and velocity
+        tasks.
         """
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
@@ -88,11 +82,8 @@ class TaskEquations:
         """Return the targets of all tasks (poses and velocities) as a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
-        rotation and angular velocity (9, 3), direction and angular velocity (3, 3).
-
-        Args:
-            time: Symbol that the tracks are functions of: the time, s, or a path parameter.
-            pace: Rate of a path parameter, 1/s.
+        rotation and angular velocity (9, 3), direction and angular velocity (3, 3). Of a path parameter in place of the
+        time, `pace` is the rate, 1/s.
 
         Raises:
             ProblemError: A track has a wrong size, is not finite, or depends on anything but the time.
@@ -171,10 +162,9 @@ class TaskEquations:
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
         """Return the deviations of the tips from their tasks by name, each as arguments of `Problem.watch`.
 
-        For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
-        residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
-        enforced at velocity or acceleration level, errors too small for that equation may accumulate. A pose may
-        deviate by the start gap of its task, which the feedback closes, and by the tolerance of its task.
+        For poses these are their errors, for velocities the integral of their residual; each is judged relative to the
+        path of the tips. A pose may deviate by the start gap of its task, which the feedback closes, and by its
+        tolerance.
         """
         tolerances, gaps = self.tolerances, self.by_row(lambda task: task.start_gap)
         gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default gap is not closed
@@ -209,15 +199,10 @@ class TaskEquations:
         return np.array(angular, dtype=bool)
 
     def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
-        """Return the residual of the task equations for joint accelerations, including pose feedback. Shape (size, 1).
+        """Return the residual of the task equations for joint accelerations u', (n, 1), with feedback. Shape (size, 1).
 
-        d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
-
-        Args:
-            base, joints, rates: Symbols.
-            second: Joint accelerations u', (joint_size, 1).
-            progress: The time, as for `targets`; or a path parameter, its pace, which is a symbol too, and the rate of
-                the pace, 1/s^2.
+        d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0. `progress` is the
+        symbol of the time; or a path parameter, its pace, which is a symbol too, and the rate of the pace, 1/s^2.
         """
         time, pace, change = progress if len(progress) > 1 else (progress[0], 1, 0)
         residual = self.residual(base, joints, rates, self.targets(time, pace))
@@ -252,11 +237,11 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors (m, near zero rad) that does not vanish at a rotation error of half a turn.
+        """Return a column of pose errors, m and chords of the unit circle, which no rotation error of half a turn makes
+        zero.
 
-        In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
-        prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
-        vector. Velocity tasks have no entries.
+        If all rotation is prescribed, the chords (2 sin(angle / 2), near zero the angle in rad) are the differences of
+        the frame axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries.
         """
         rows: list[Any] = [ca.DM(0, 1)]
         for part, target in self.by_task(targets):
@@ -316,10 +301,7 @@ class TaskEquations:
 
     @on_scalars
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the differences of the tip poses of velocity tasks between a configuration and a reference one.
-
-        For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
-        """
+        """Return the pose errors (rows, 1) of the tips of velocity tasks from those in a reference configuration."""
         rows: list[Any] = [ca.DM(0, 1)]
         for part in (part for part in self.bound if not part.task.is_pose):
             position, rotation = (ca.DM(value) for value in part.pose_in_reference(at_base, at_joints))
@@ -362,10 +344,7 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function of configuration and targets: task matrix J, right-hand side b and pose errors.
-
-        (base, joints, targets) -> (J, b, pose error, pose residual).
-        """
+        """CasADi Function (base, joints, targets) -> (J, b, pose error, pose residual)."""
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
@@ -402,9 +381,8 @@ class TaskEquations:
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
         """Return the combinations of task equations whose integral vanishes if the joints return. Shape (size, k).
 
-        If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
-        fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
-        of mass stays. Rows whose integral depends on the path do not count.
+        Closure follows from all holonomic rows on a fixed base; on a floating base from the combinations of rows that
+        are independent of the base pose while the centre of mass stays.
 
         Raises:
             ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -475,14 +453,5 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
 def task_errors(
     machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, joints: Any, *, base: Any = None
 ) -> Array:
-    """Return the pose errors of tasks along a motion, m and rad; 0 for velocity tasks. Shape (M, size).
-
-    Args:
-        t: Times, s. Shape (M,).
-        joints: Joint positions. Shape (M, joint_size).
-        base: Base configurations. Shape (M, base_size), or None on a fixed base.
-
-    Returns:
-        Shape (M, rows of all tasks).
-    """
+    """Return the pose errors of tasks at times (M,) of a motion, m and rad; 0 for velocities. Shape (M, rows)."""
     return bind(machine, tasks).errors(t, base, joints)

@@ -33,10 +33,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a value as (Start, joint positions of shape (n,) or None if free, base configuration), all checked.
-
-        Args:
-            value: A start, joint positions, or None.
+        """Return a start, joint positions or None as (Start, joint positions (n,) or None if free, base configuration).
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -48,10 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a value as (Start, joint positions of shape (n,), base configuration); no position may be free.
-
-        Args:
-            value: A start with joint positions, or joint positions.
+        """Return a start or joint positions as (Start, joint positions (n,), base configuration); none may be free.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.
@@ -234,10 +228,8 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the weights of the squared joint velocities: `velocity` times the weight of each joint. Shape (size,).
-
-        Raises:
-            ProblemError: The number of weights is not the number of joints, or a weight is not positive.
+        """Return the checked weights of the squared joint velocities: `velocity` times those of the joints. Shape
+        (size,).
         """
         return self.velocity * checked_weights(self.weights, size)
 

@@ -263,12 +263,7 @@ def _refuse_ramps(reason: str, **arguments: Any) -> None:
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task whose targets are functions of a path parameter to a task whose targets are functions of time.
-
-    Args:
-        task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
-        clock: CasADi function time (s) -> parameter.
-    """
+    """Convert a task of a path parameter to a task of time, by the CasADi function `clock`: time (s) -> parameter."""
 
     def velocity(time: Any) -> Any:
         parameter = clock(time)
@@ -436,10 +431,8 @@ def cross_product(a: Any, b: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of the selected task equations that no base motion with a fixed centre of mass affects.
-
-    Raises:
-        ProblemError: The momentum moves the centre of mass, and the joints cannot return.
+    """Return the combinations of the selected task equations that no base motion with a fixed centre of mass affects;
+    raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return.
     """
     jacobians = []
     for bound in bound_tasks:
