@@ -130,9 +130,7 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add the task `rows` q'' = `target`, which changes the joint accelerations q'' as little as possible in the
-        null space of all tasks added before.
-        """
+        """Add the task `rows` q'' = `target`, with the least change of q'' in the null space of all tasks before."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
@@ -169,14 +167,11 @@ def accelerations(
     """Return the joint accelerations that a redundancy resolution law commands. Shape (n, 1).
 
     Args:
-        machine: The machine.
-        equations: Equations of the tasks.
-        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together,
-            equation (20). ``null_space``: the zero moment point in the null space of the tasks, (21)-(22).
-            ``stabilised``: like augmented, with the centre of mass commanded in their null space.
+        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, equation (20).
+            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
+            augmented, with the centre of mass commanded in their null space.
         state: Time, joint positions and joint velocities, symbols of one kind.
         external: External wrenches as a function of time and tip position.
-        options: Target of the zero moment point, layers, gains and damping; `AccelerationOptions()` if None.
     """
     (time, q, qd), own = state, options or AccelerationOptions()
     directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
@@ -212,8 +207,7 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return the matrix and the right side of linear equations for the joint accelerations that keep a machine upright,
-    see `Stabiliser`.
+    """Return matrix and right side of equations for the accelerations that keep a machine upright, see `Stabiliser`.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -241,12 +235,8 @@ STEPS_PER_CALL = 50
 class Stop:
     """Reason why a simulated motion ends before its horizon, and the time at which it ends.
 
-    Attributes:
-        reason: ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed
-            limit. ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external`
-            is not a number.
-        time: Time of the stop, s.
-        message: The reason in words, with the numbers.
+    ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed limit.
+    ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external` is not a number.
     """
 
     reason: Literal["lift_off", "divergence", "breakdown"]
@@ -256,20 +246,12 @@ class Stop:
 
 @dataclass(frozen=True)
 class AccelerationSolution:
-    """Motion that results from an acceleration-level control law.
-
-    Attributes:
-        law: The law.
-        motion: Positions, velocities, accelerations and forces at every step up to the end or the stop; the sample of
-            the stop is the last one if it is finite.
-        tip_error: Norm of the pose errors in the rows of the tasks, m and rad; zero for velocities. Shape (M,).
-        stopped: Why the motion ends before the horizon; None if it does not.
-    """
+    """Motion that results from an acceleration-level control law."""
 
     law: Law
-    motion: StandingMotion
-    tip_error: Array
-    stopped: Stop | None
+    motion: StandingMotion  # at every step up to the end or the stop, whose sample is the last one if it is finite
+    tip_error: Array  # norm of the pose errors in the rows of the tasks, m and rad; zero for velocities, (M,)
+    stopped: Stop | None  # why the motion ends before the horizon; None if it does not
 
     @property
     def failures(self) -> tuple[str, ...]:

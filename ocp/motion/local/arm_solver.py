@@ -51,7 +51,6 @@ class ArmSolver:
     """Solver of all inverse kinematics solutions of an arm within its limits. Use `arm_solver` to build it.
 
     Attributes:
-        chain: Chain of the arm.
         solvers: Solvers of six joints, or four of a SCARA, for several choices of the sampled joints; the
             best-conditioned one first. Their chains have further joints at the end.
         auxiliary: Indices of the auxiliary joints, which must stay at zero.
@@ -80,14 +79,9 @@ class ArmSolver:
     ) -> tuple[Solutions, NDArray[np.bool_]]:
         """Return all isolated IK solutions within the limits at M poses, and flags of poses where some may be missing.
 
-        Revolute joints are shifted by whole turns in all ways that keep the limits; unlimited ones are between -pi and
-        pi. Joints that do not move the tip are at 0.
-
-        Args:
-            solver: One of the solvers.
-            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
-            redundant: Positions of the redundant joints of the solver. Shape (M, k).
-            turns: Whether all whole turns are listed, or only the one farthest from the limits.
+        Revolute joints are shifted by whole turns in all ways that keep the limits (with `turns` False, only to the one
+        farthest from them); unlimited ones are between -pi and pi. `redundant` has the positions of the redundant
+        joints of the solver, (M, k). Joints that do not move the tip are at 0.
         """
         solutions, doubtful = solver.solve(positions, rotations, redundant)
         n, extended = len(self.chain.axes), solver.chain
@@ -127,9 +121,7 @@ class ArmSolver:
 
 @lru_cache(maxsize=256)
 def _whole_turns(counts: tuple[int, ...]) -> Array:
-    """Return all combinations of 0 to count - 1 whole turns of several joints, rad; each joint has its own count. Shape
-    (combinations, joints).
-    """
+    """Return all combinations of 0 to count - 1 whole turns of several joints, rad. Shape (combinations, joints)."""
     return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
 
 
@@ -137,10 +129,8 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
     """Return the inverse kinematics solver of an arm; None if no choice of joints can be solved for.
 
     Args:
-        chain: Chain of the arm.
         lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
-        axes: Axes through the tip at the zero configuration about which the task leaves the orientation open. Shape
-            (k, 3).
+        axes: Axes (k, 3) through the tip at zero about which the task leaves the orientation open.
     """
     virtual = np.zeros((0, 3)) if axes is None else axes
     extended = chain.extend(virtual, np.tile(chain.position, (len(virtual), 1)))
@@ -169,9 +159,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return, for each choice of redundant joints, the geometric mean over random configurations of the least singular
-    value of the Jacobian of the other joints.
-    """
+    """Return the geometric mean of the least singular value of the Jacobian for each choice of redundant joints."""
     _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
     columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
     values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]

@@ -48,12 +48,7 @@ NEARBY = NearbySettings()
 
 @dataclass(frozen=True, eq=False)
 class PoseSolver(ABC):
-    """Base class of solvers of the inverse kinematics of a chain for given positions of its redundant joints.
-
-    Attributes:
-        chain: The chain.
-        redundant: Indices of the joints whose positions are given.
-    """
+    """Base class of solvers of the inverse kinematics of a chain for given positions of its redundant joints."""
 
     chain: Chain
     redundant: tuple[int, ...]
@@ -67,13 +62,8 @@ class PoseSolver(ABC):
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return the IK solutions at M poses of the tip; at singular poses some solutions may be missing.
 
-        Args:
-            tips: Poses of the tip in the world.
-            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
-
-        Returns:
-            The solutions; masks of the poses where it must be confirmed that these are all, and of those where some may
-            be missing. Shapes (M,), bool.
+        `redundant` has the positions of the redundant joints, (M, k). Return also masks (M,) of the poses where it must
+        be confirmed that these are all, and of those where some may be missing.
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
@@ -81,10 +71,6 @@ class PoseSolver(ABC):
 
         Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
         continuously on the pose, and of a family some members are found.
-
-        Args:
-            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
-            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
         """
         tips, count = Motion(rotations, positions), len(positions)
         solutions, unconfirmed, doubtful = self.solve_regular(tips, redundant)
@@ -130,15 +116,10 @@ FORMS = FormSettings()
 
 @dataclass(frozen=True, eq=False)
 class ClosedForm(PoseSolver):
-    """Solver of the inverse kinematics of an arm in closed form.
+    """Solver of the inverse kinematics of an arm in closed form."""
 
-    Attributes:
-        kind: "meeting" or "parallel", by the axes of three of its joints, or "scara".
-        triple: Indices of these joints.
-    """
-
-    kind: str
-    triple: tuple[int, ...]
+    kind: str  # "meeting" or "parallel", by the axes of three of its joints, or "scara"
+    triple: tuple[int, ...]  # indices of these joints
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return IK solutions at M poses of the tip; continuous families of solutions may be incomplete."""
@@ -197,9 +178,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a tip pose that returns candidate angles of the first and the third joint of `_loop`, x and z,
-        with their residuals and conditioning.
-        """
+        """Function of a tip pose: candidate angles of the joints x and z of `_loop`, residuals and conditioning."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -242,28 +221,16 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
+    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose."""
 
-    Attributes:
-        symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
-        axes: Axes of the joints.
-        order: Indices of the joints.
-        goal: The goal.
-    """
-
-    symbols: Any
+    symbols: Any  # positions of the redundant joints, rows of the rotation of the tip, its position, (k + 12,)
     axes: list[SymbolicAxis]
-    order: list[int]
+    order: list[int]  # indices of the joints
     goal: Frame
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers of a chain, one for each choice of redundant joints that has a closed form.
-
-    Args:
-        chain: The chain.
-        lockable: Indices of the joints that may be redundant; None: all.
-    """
+    """Return the closed-form solvers of a chain, one for each choice of redundant, `lockable` joints that has one."""
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
     return _six_joint_forms(chain, chain.order if lockable is None else tuple(lockable))
@@ -369,10 +336,10 @@ def _rotation(angle: Any) -> Any:
 
 
 def _close_roots(f: Harmonics) -> Any:
-    """Return eight angles that include all roots of a trigonometric polynomial; double roots become close pairs.
+    """Return eight angles (8, 1) that include all roots of a trigonometric polynomial; double roots become close pairs.
 
     Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
-    curvature there has both. Shape (8, 1).
+    curvature there has both.
     """
     size = TINY + sum(map(ca.fabs, f))
     f = Harmonics(*(part / size for part in f))
@@ -388,16 +355,14 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the mean and half the difference of the two roots q of cosine cos(q) + sine sin(q) = value, or of the
-    nearest equation that has a root.
-    """
+    """Return mean and half the difference of the roots q, or nearest angles, of cosine cos(q) + sine sin(q) = value."""
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions for three joints whose axes meet or are parallel and that must produce a given rotation or
-    planar motion, and the share by which this motion is out of their reach; the solutions are then the nearest.
+    """Return two solutions for three joints that must produce a rotation, if their axes meet, or a planar motion, if
+    they are parallel, and the share by which this motion is out of their reach; the solutions are then the nearest.
     """
     a, b, c = axes
     goal_point = goal.point(c.point)

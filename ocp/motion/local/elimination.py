@@ -7,10 +7,10 @@ direction of its axis, so that a point p on it and its direction l satisfy
 
 On both sides take the 15 numbers 1, p, p.p, l, p.l, p x l and p.p l - 2 p.l p: the conformal coordinates of the point
 and of the line element in it. Each joint acts on them by a matrix that is linear in cos q and sin q, or quadratic in a
-displacement: both are quadratic forms on the projective line, 1, cos h and sin h of an angle h with q = h, or
-q = size tan(h / 2). The 15 x 9 matrix of the products of x and y has a left null space of six rows, which removes x and
-y; times cos(h / 2) and sin(h / 2) of one of z, a, b they are twelve equations, linear in twelve products of that angle
-and another one and quadratic in the third: a polynomial eigenvalue problem with 24 eigenvalues. At most 16 of them are
+displacement: both are quadratic forms on the projective line, 1, cos h and sin h of an angle h with q = h, or q = size
+tan(h / 2). The 15 x 9 matrix of the products of x and y has a left null space of six rows, which removes x and y; times
+cos(h / 2) and sin(h / 2) of one of z, a, b they are twelve equations, linear in twelve products of that angle and
+another one and quadratic in the third: a polynomial eigenvalue problem with 24 eigenvalues. At most 16 of them are
 solutions; half-angles are rotated such that no solution is at infinity.
 
 The loop may be opened at any of its joints, and each opening leaves six ways to choose the angles. Where axes meet or
@@ -85,10 +85,7 @@ def axial(turn: Array) -> Array:
 
 
 class Axis(NamedTuple):
-    """Axis of a joint at M poses: unit directions (M, 3), points on it (M, 3), and whether the joint is revolute.
-
-    A single row, (1, 3), applies to all poses.
-    """
+    """Axis of a joint, unit direction and point on it: at each of M poses, (M, 3), or for all poses, (1, 3)."""
 
     direction: Array
     point: Array
@@ -113,16 +110,11 @@ class Axis(NamedTuple):
 
 
 class LoopOpening(NamedTuple):
-    """Choice of the joint at which the kinematic loop is opened, and of the roles of the joints in the elimination.
+    """Choice of the joint at which the kinematic loop is opened, and of the roles of the joints in the elimination."""
 
-    Attributes:
-        first: Index of the joint x; the others follow in the order of the loop.
-        rank: Number of independent products of x and y at a regular pose.
-        roles: Which of z, a, b is the eigenvalue, which has products with half-angles, and which remains.
-    """
-
-    first: int
-    rank: int
+    first: int  # index of the joint x; the others follow in the order of the loop
+    rank: int  # number of independent products of x and y at a regular pose
+    # which of z, a, b is the eigenvalue, which has products with half-angles, and which remains
     roles: tuple[int, int, int]
 
 
@@ -135,37 +127,23 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate IK solutions that result from one opening of the kinematic loop.
+    """Candidate IK solutions that result from one opening of the kinematic loop."""
 
-    Attributes:
-        pose: Index of the pose of each candidate. Shape (K,).
-        free: Positions of the free joints. Shape (K, 6).
-        least: How many solutions each pose has at least, from simple real eigenvalues. Shape (M,).
-        mixed: Which poses have multiple real eigenvalues. Shape (M,), bool.
-        singular: Which poses have a singular problem. Shape (M,), bool.
-    """
-
-    pose: NDArray[np.intp]
-    free: Array
-    least: NDArray[np.intp]
-    mixed: Mask
-    singular: Mask
+    pose: NDArray[np.intp]  # index of the pose of each candidate, (K,)
+    free: Array  # positions of the free joints, (K, 6)
+    least: NDArray[np.intp]  # how many solutions each pose has at least, from simple real eigenvalues, (M,)
+    mixed: Mask  # which poses have multiple real eigenvalues, (M,)
+    singular: Mask  # which poses have a singular problem, (M,)
 
 
 @dataclass(frozen=True, eq=False)
 class Elimination(PoseSolver):
-    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it.
+    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it."""
 
-    Attributes:
-        openings: Openings of the loop that have regular problems, the best first.
-    """
-
-    openings: tuple[LoopOpening, ...]
+    openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip; at singular poses some may be missing.
-
-        See `PoseSolver.solve_regular`.
+        """Return the IK solutions at M poses of the tip, see `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -257,10 +235,8 @@ def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Separate the terms of the first two joints of a loop, which are eliminated, from the terms of the other joints.
-
-    Return singular vectors (M, 15, 15) and ranks (M,) of the terms to eliminate, and coefficients (M, 15, 3, 3, 3) of
-    the other terms, or (1, ...) if these are the same for all poses.
+    """Return singular vectors (M, 15, 15) and ranks (M,) of the terms of the first two joints of a loop, which are
+    eliminated, and coefficients (M or 1, 15, 3, 3, 3) of the terms of the other joints.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -274,9 +250,8 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coefficients (M, 15, 3, ...) with which the conformal coordinates of a line element depend on 1, cos h
-    and sin h of the joints that move it, of the last one first; `axes` begins with the joint that moves the line
-    element first.
+    """Return the coefficients (M, 15, 3, ...) of the conformal coordinates of a line element in 1, cos h and sin h of
+    the joints that move it, the last one first; `axes` begins with the joint that moves the line element first.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
@@ -308,9 +283,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the coefficients of 1, cos h and sin h in the eigenvalue problem of an opened kinematic loop, h the angle
-    of the joint that has the eigenvalue. Shape (M, 3, 12, 12).
-    """
+    """Return the coefficients (M, 3, 12, 12) of 1, cos h and sin h, h the eigenvalue angle, in the problem."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -324,9 +297,8 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices of eigenvalue problems, the angles at eigenvalue 0, and reciprocal condition numbers.
-
-    The problems are polynomial; the eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
+    """Return companion matrices (M, 24, 24), the angles (M,) at eigenvalue 0, and reciprocal condition numbers (M,) of
+    polynomial eigenvalue problems, whose eigenvalues are tan((h - pole) / 2) of an angle h.
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))

@@ -178,23 +178,14 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """Arm with the solver of its inverse kinematics and the part of the tip's orientation that a task leaves free.
-
-    Attributes:
-        arm: Solver of the arm.
-        free: Part of the orientation that the task leaves free.
-        tool_axis: Axis of the roll in the frame of the tip.
-        sampled_angles: Number of free angles that are sampled.
-        within: Half-angle of the cone, rad.
-        names: Names of the joints.
-    """
+    """Arm with the solver of its inverse kinematics and the part of the tip's orientation that a task leaves free."""
 
     arm: ArmSolver
     free: ToolFreedom
-    tool_axis: Array
-    sampled_angles: int
-    within: float
-    names: tuple[str, ...]
+    tool_axis: Array  # axis of the roll in the frame of the tip
+    sampled_angles: int  # number of free angles that are sampled
+    within: float  # half-angle of the cone, rad
+    names: tuple[str, ...]  # of the joints
 
     @classmethod
     def of(
@@ -230,11 +221,8 @@ class PreparedArm:
     ) -> tuple[Array, NDArray[np.intp], tuple[Incompleteness, ...]]:
         """Return IK configurations (K, n), the indices (K,) of their poses, and why some may be missing at each pose.
 
-        Args:
-            solver: One of the solvers of the arm.
-            positions, rotations: Shapes (N, 3), (N, 3, 3).
-            shares: Samples of the parameters as shares of their ranges. Shape (S, k).
-            turns: Whether all whole turns are listed, or only the one farthest from the limits.
+        `shares` (S, k) samples the parameters as shares of their ranges. With `turns` all whole turns are listed, else
+        only the one farthest from the limits.
         """
         count, samples = len(positions), len(shares)
         if (
@@ -270,8 +258,8 @@ class PreparedArm:
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free, from fractions of
-        full turns of roll and azimuth and of the area of the cone's cap. Shape (S, 3, 3).
+        """Return samples (S, 3, 3) of the tip rotations that the task leaves free, in the tip frame, from shares of
+        full turns of roll and azimuth and of the area of the cone's cap.
         """
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
@@ -303,9 +291,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 class IkBranches:
     """Solver of all IK configurations of a pose task at samples of its free parameters. Use `ik_branches` to create it.
 
-    Attributes:
-        arm: The prepared arm.
-        complete: Whether the task leaves no parameter free, so that all configurations are listed.
+    `complete` tells whether the task leaves no parameter free, so that all configurations are listed.
     """
 
     def __init__(self, equations: TaskEquations, arm: PreparedArm) -> None:
@@ -315,17 +301,14 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return IK configurations of all branches within the joint limits, at samples of the free parameters.
-
-        Joints without limits are between -pi and pi.
+        """Return configurations at task targets (size,) and samples of the free parameters; unlimited angles up to pi.
 
         Args:
-            targets: Targets of the equations. Shape (size,).
             count: Number of samples of the free parameters, over several choices of the sampled joints.
             number: Number of the first sample; a different one gives other samples.
             turns: Whether all whole turns are listed, or only the one farthest from the limits.
-            choices: Largest number of choices of the sampled joints; None: all that have a solver. Each is singular at
-                other configurations.
+            choices: Largest number of choices of the sampled joints, each singular at other configurations; None for
+                all.
         """
         solvers = self.arm.arm.solvers[:choices]
         position, rotation = targets[None, :3], self._rotation(targets)[None]
@@ -355,12 +338,10 @@ class IkBranches:
 
 
 def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
-    """Return the solver of all IK branches of a pose task; None if no such solver exists for the task or machine.
+    """Return the solver of all IK branches of a task; None if no such solver exists for the task or machine.
 
-    Args:
-        equations: Equations of one pose of the tip of an arm in the world: the whole pose, a position and a direction
-            or a cone about it, a position alone, or, on a SCARA, a position and the rotation about its axes.
-        lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
+    There is one for a pose of the tip of an arm in the world: the whole pose, a position and a direction or a cone
+    about it, a position alone, or, on a SCARA, a position and the rotation about its axes.
     """
     if len(equations.bound) != 1:
         return None

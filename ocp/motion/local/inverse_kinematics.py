@@ -77,18 +77,11 @@ IK_OPTIONS = IkOptions()
 
 @dataclass(frozen=True)
 class IkSolution:
-    """Solution of inverse kinematics: joint positions at a target pose.
+    """Solution of inverse kinematics: joint positions at a target pose."""
 
-    Attributes:
-        joints: Joint positions. Shape (joint_size,), rad or m.
-        quality: Manipulability of the task times the least distance of a joint from its limits, as a share of half its
-            range: 0 at a limit or a singularity.
-        pose_error: Largest remaining pose error of all tasks, m or rad.
-    """
-
-    joints: Array
-    quality: float
-    pose_error: float
+    joints: Array  # (n,), rad or m
+    quality: float  # manipulability times the least distance of a joint from its limits, as a share of half its range
+    pose_error: float  # largest remaining pose error of all tasks, m or rad
 
 
 class Unreachable(ProblemError):
@@ -217,9 +210,7 @@ def inverse_kinematics_at(
     near: Array | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return IK solutions of a fixed-base machine for numerical task targets, by iterations from initial guesses.
-
-    Unlike `inverse_kinematics`, this function does not list all branches first.
+    """Return IK solutions of a fixed-base machine for numerical task targets, by iterations from initial guesses alone.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -241,8 +232,7 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality; raise
-        Unreachable if there is none.
+        """Return the distinct IK solutions to which guesses (K, n) lead, by decreasing quality, or raise Unreachable.
 
         Unlimited angles that result from the last `random` guesses are wrapped to -pi .. pi.
         """
@@ -259,8 +249,8 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, none if there is no solver of all branches, and how many random
-        initial guesses shall be tried in addition.
+        """Return IK solutions (K, n) on all branches, if there is a solver of these, and how many random guesses to
+        add.
         """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
@@ -435,11 +425,7 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return an error that inverse kinematics found no solution; it states the smallest pose error reached.
-
-    Args:
-        misses: Distance, m, and angle, rad, of the nearest configuration from the target.
-    """
+    """Return an error that inverse kinematics found no solution; `misses` are the distance, m, and angle, rad, left."""
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]

@@ -42,10 +42,8 @@ class LocalSolution:
 
     Attributes:
         t: Times, the first 0. Shape (M,), s.
-        base: Base configuration, as the machine defines it. Shape (M, base_size).
-        joints: Joint positions. Shape (M, joint_size), rad or m.
-        joint_rates: Joint rates. Shape (M, joint_size).
-        base_rates: Time derivative of `base`. Shape (M, base_size).
+        base, joints: Base configuration and joint positions. Shapes (M, base_size), (M, joint_size).
+        base_rates, joint_rates: Their time derivatives.
         tip_in_world: Position of the tip. Shape (M, 3), m.
         manipulability: Undamped manipulability of the rows of the tasks. Shape (M,).
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
@@ -53,8 +51,7 @@ class LocalSolution:
         stopped: Reason why the motion ends before the horizon, None if it does not.
         clearance: Least distance of two bodies, m, nan without a collision scene. Shape (M,).
         nearest: Names of these two bodies at each time; empty without a collision scene.
-        task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows of
-            all tasks).
+        task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows).
     """
 
     t: Array
@@ -170,15 +167,13 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the least joint rates for a task velocity, by the damped pseudo-inverse. Shape (n, k).
-
-    They are W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W the diagonal matrix of the weights.
+    """Return the least joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v. Shape (n, k).
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
         velocity: v, or several as columns. Shape (m, k).
-        damping: Damping, in units of the Jacobian.
-        weights: Positive weights of the squared joint rates. Shape (n,).
+        damping: In units of the Jacobian.
+        weights: Diagonal of W, weights of the squared joint rates; all 1 if None. Shape (n,).
     """
     weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
     square = ca.mtimes(jacobian, weighted) + damping**2 * ca.DM.eye(jacobian.shape[0])
@@ -302,34 +297,19 @@ CORRECTIONS = 2
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:
-    """K motions at M times from local redundancy resolution (resolved-rate control).
+    """K motions at M times from local redundancy resolution (resolved-rate control)."""
 
-    Attributes:
-        t: Times. Shape (M,), s.
-        base: Base configurations. Shape (K, M, base_size).
-        joints: Joint positions, within the limits. Shape (K, M, joint_size).
-        rates: Mean joint rates from each time to the next; the last ones are repeated. Shape (K, M, joint_size).
-        cost: Integral of half the weighted squared joint rates. Shape (K,).
-        pose_error: Largest pose error, m and rad; infinite if a motion diverges. Shape (K,).
-        worst_time: Time of the largest pose error, s. Shape (K,).
-    """
-
-    t: Array
-    base: Array
-    joints: Array
-    rates: Array
-    cost: Array
-    pose_error: Array
-    worst_time: Array
+    t: Array  # (M,), s
+    base: Array  # (K, M, base_size)
+    joints: Array  # within the limits, (K, M, joint_size)
+    rates: Array  # mean joint rates from each time to the next; the last ones are repeated, (K, M, joint_size)
+    cost: Array  # integral of half the weighted squared joint rates, (K,)
+    pose_error: Array  # largest one, m and rad; infinite if a motion diverges, (K,)
+    worst_time: Array  # time of the largest pose error, s, (K,)
 
     @classmethod
     def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Return motions that stay at given configurations.
-
-        Args:
-            times: Times. Shape (M,), s.
-            base, joints: Configurations. Shapes (K, base_size) and (K, joint_size).
-        """
+        """Return motions that stay at given configurations (K, base_size) and (K, joint_size)."""
         count, samples = len(joints), len(times)
         rates, zeros = np.zeros((count, samples, joints.shape[1])), np.zeros(count)
         bases, positions = (np.repeat(each[:, None], samples, axis=1) for each in (base, joints))
@@ -373,12 +353,9 @@ def track_tasks(
     lower: Array,
     upper: Array,
 ) -> LocalMotion:
-    """Track tasks from several start configurations by resolved-rate control.
+    """Track tasks from several start configurations (K, joint_size) and (K, base_size) by resolved-rate control.
 
     Args:
-        equations: Equations of the tasks.
-        joints: Joint positions at the first time. Shape (K, joint_size).
-        base: Base configurations at the first time. Shape (K, base_size).
         times: Increasing times, s. Shape (M,).
         weights: Weights of the squared joint rates. Shape (joint_size,).
         damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.

@@ -59,7 +59,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints, (n,), that move no frame or reference of a task; none if joints move a base or balance."""
+        """Mask of the joints, (n,), that move no frame or reference of a task; none if they move a base or balance."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
@@ -68,9 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations, such as "rad/s, m/s", for given time units of pose and velocity
-        tasks.
-        """
+        """Return the units of the task equations as text; `pose` and `velocity` are time units of both kinds of tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []
@@ -237,8 +235,7 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors, m and chords of the unit circle, which no rotation error of half a turn makes
-        zero.
+        """Return a column of pose errors, m and chords of the unit circle, not zero at a rotation error of half a turn.
 
         If all rotation is prescribed, the chords (2 sin(angle / 2), near zero the angle in rad) are the differences of
         the frame axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries.

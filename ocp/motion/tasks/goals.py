@@ -228,9 +228,7 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the checked weights of the squared joint velocities: `velocity` times those of the joints. Shape
-        (size,).
-        """
+        """Return the checked weights (size,) of the squared joint velocities: `velocity` times those of the joints."""
         return self.velocity * checked_weights(self.weights, size)
 
     def __repr__(self) -> str:

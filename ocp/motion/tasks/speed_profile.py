@@ -224,7 +224,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) reached over a distance (m): the inverse of ramp_distance."""
+    """Return the greatest speed (m/s) that is reached over a distance (m), the inverse of ramp_distance."""
     # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
     # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
@@ -253,7 +253,7 @@ def ramp_phases(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def rest_profile(length: float, speed: float, acceleration: float, jerk: float) -> SpeedProfile:
-    """Return the fastest motion from rest to rest over a length (m), with the largest reachable speed if it is short."""
+    """Return the fastest motion from rest to rest over a length (m), at the largest reachable speed if it is short."""
     for name, value in (("length", length), ("speed", speed), ("acceleration", acceleration), ("jerk", jerk)):
         require.positive(name, value)
     peak = min(speed, reachable_speed(0.0, length / 2, acceleration, jerk))
