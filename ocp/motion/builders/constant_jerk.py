@@ -6,10 +6,6 @@ sped up. With the largest acceleration a that it reaches, its peak velocity is a
 
     d = peak (2 t_j + t_a + t_v).
 
-A motion of several joints takes at least as long as each joint by itself. `synchronised_motion` attains this bound: by
-a straight motion in joint space if the limits of all joints allow it, else by slowing down the profile of each joint to
-the common duration. Without jerk limits the phases have constant acceleration.
-
 Without friction, torques of a motion that is slowed down by a factor f are
 
     torque(q, rate / f, acceleration / f^2) = rest(q) + (torque(q, rate, acceleration) - rest(q)) / f^2,
@@ -98,31 +94,16 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least time in which each joint by itself moves by a given distance from rest to rest within limits.
-
-    Args:
-        distances: Absolute distances, rad or m. Shape (..., n).
-        bounds: Limits of the joints; those of velocity, acceleration and jerk apply.
-
-    Returns:
-        Durations, s; 0 for a joint without limits. Shape (..., n).
-    """
+    """Return the least time, s, in which each joint by itself moves by a distance from rest to rest. Shape (..., n)."""
     return _ramps(distances, bounds.velocity, bounds.acceleration, bounds.jerk).duration
 
 
 def least_squared_velocities(distances: Array, duration: float, acceleration: Array) -> Array:
-    """Return the least integral of the squared velocity of each joint alone, from rest to rest in a given time.
+    """Return the least integral of each joint's squared velocity, from rest to rest over distances d. Shape (..., n).
 
-    Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity
-    v = 2 d / (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a).
-
-    Args:
-        distances: Absolute distances d, rad or m. Shape (..., n).
-        duration: Duration T of the motion, s.
-        acceleration: Largest accelerations a, infinite if not limited. Shape (n,).
-
-    Returns:
-        Integrals, inf where the duration is too short. Shape (..., n).
+    Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity v = 2 d /
+    (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a). It is infinite where the
+    duration T is too short.
     """
     root = np.sqrt(np.maximum(duration**2 - 4 * distances / acceleration, 0.0))
     velocity = np.divide(2 * distances, duration + root, out=np.zeros_like(root), where=distances > 0)
@@ -132,15 +113,10 @@ def least_squared_velocities(distances: Array, duration: float, acceleration: Ar
 
 @dataclass(frozen=True, eq=False)
 class ConstantJerkMotion:
-    """Motion of several joints in consecutive phases of constant jerk.
+    """Motion of several joints in K consecutive phases of constant jerk."""
 
-    Attributes:
-        durations: Durations of the phases, s. Shape (K,).
-        joints, rates, accelerations, jerks: Joint positions and derivatives where each phase starts. Shape (K, n).
-    """
-
-    durations: Array
-    joints: Array
+    durations: Array  # of the phases, s, (K,)
+    joints: Array  # positions where each phase starts, (K, n), as the derivatives
     rates: Array
     accelerations: Array
     jerks: Array
@@ -156,10 +132,7 @@ class ConstantJerkMotion:
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return joint positions, rates and accelerations at fractions (M,) of the duration of each phase.
-
-        Shape (K, M, n) each.
-        """
+        """Return joint positions, rates and accelerations (K, M, n) at fractions (M,) of each phase's duration."""
         t = (self.durations[:, None] * places)[:, :, None]
         joints, rates, accelerations, jerks = (
             each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
@@ -171,11 +144,9 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion in the form of a solution of a `dynamics_problem`, but without multipliers.
+        """Return the motion as a solution of a `dynamics_problem` without the control "power", and without multipliers.
 
-        Args:
-            problem: The problem, which must not have the control "power".
-            method: Phrase for what the motion does, such as "stops at the corners of a path".
+        `method` is a phrase for what the motion does, such as "stops at the corners of a path".
         """
         form, horizon = Formulation.of(problem), self.duration
         breaks = np.append(0.0, np.cumsum(self.durations)) / horizon
@@ -244,11 +215,7 @@ class TorqueLimits:
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the limited torques, then the limited powers, at M samples of a motion, and their Jacobians.
-
-        The Jacobians are those with respect to joint positions, rates and accelerations. Shapes (M, R), and (M, R, n)
-        for each Jacobian.
-        """
+        """Return the limited torques, then powers (M, R), and their Jacobians in position, rate and acceleration."""
         values, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
         return values, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
@@ -264,9 +231,7 @@ class TorqueLimits:
         return self._samplers[linearised]
 
     def slow_down(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
-        """Return the motion slowed down by the smallest factor at which its samples satisfy the torque limits.
-
-        If they then exceed power limits, the motion is slowed down further.
+        """Return the motion slowed down by the smallest factor at which its samples satisfy torque and power limits.
 
         Raises:
             SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
@@ -300,11 +265,8 @@ class TorqueLimits:
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
     """Return a time-optimal joint motion from rest to rest within velocity, acceleration and jerk limits.
 
-    It is straight if a straight motion attains the least time.
-
-    Args:
-        start, goal: Configurations, rad or m. Shape (n,).
-        bounds: Limits of the joints.
+    A motion takes at least as long as each joint by itself. A straight motion in joint space attains this bound if the
+    limits of all joints allow it, else the profile of each joint is slowed down to the common duration.
     """
     change = goal - start
     own = _ramps(np.abs(change), *_finite_limits(np.abs(change), bounds))
@@ -316,13 +278,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
 
 
 def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
-    """Return a motion within joint and torque limits that follows a joint path (M, n) and stops at each corner.
-
-    Each segment is the fastest without torque limits, slowed down to them.
-
-    Raises:
-        SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
-    """
+    """Return a motion along a joint path (M, n) that stops at each corner, slowed down to the torque limits."""
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
     parts = [torques.slow_down(_straight_motion(first, last - first, bounds)) for first, last in pairwise(corners)]
@@ -332,10 +288,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the least durations, s, of straight rest-to-rest motions in joint space without torque limits.
-
-    Shape (K,) for changes of the joint positions of shape (K, n).
-    """
+    """Return the least durations, s, (K,) of straight rest-to-rest motions by (K, n) without torque limits."""
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 

@@ -1,13 +1,9 @@
 """Optimal control of the roll, the redundant angle of the captive trajectory rig, along a whole tool trajectory.
 
-The paper, Lee, Lee 2017, resolves each target by itself, with the change of roll since the last target in the index
-(38); its roll lags behind the targets. Here the integral of the index I1, see `models.cts.roll`, and of the squared
-roll rate is minimised over all targets together.
-
-The first guess chooses the homotopy class. The rolls of least index of single targets may lie inside an obstacle, or
-jump from one side of it to the other, and from such a guess the solver finds no plan. Therefore dynamic programming
-over a grid of rolls and times finds the roll of least total cost, with penalties for targets out of reach, limits and
-clearance. The result is refined on finer and finer grids about it.
+The paper, Lee, Lee 2017, resolves each target by itself; its roll lags behind the targets. Here the integral of the
+index I1, see `models.cts.roll`, and of the squared roll rate is minimised over all targets together. The first guess
+chooses the homotopy class: dynamic programming over a grid of rolls and times finds the roll of least total cost, with
+penalties for targets out of reach, limits and clearance, and is refined on finer grids about it.
 """
 
 from __future__ import annotations
@@ -340,7 +336,7 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the index of the roll at each time of the lowest-cost path through a grid of times and rolls, in which
+    """Return the index of the roll at each time on the lowest-cost path through a grid of times and rolls, in which
     rates beyond the limit are penalised.
     """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]

@@ -163,25 +163,16 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Boundary conditions of a motion, checked against the joint limits; free positions and velocities are nan.
+    """Boundary conditions of a motion, checked against the joint limits; free positions and velocities are nan."""
 
-    Attributes:
-        first, last: Joint positions at the start and at the end. Shape (n,).
-        first_rates, last_rates: Joint velocities there. Shape (n,).
-        rests: Whether all joints are at rest at the start, and at the end.
-        base: Configuration of the base at the start; its guess where it is free.
-        joined: Whether joints or base continue from another phase.
-        start: Joint positions at the start of the guess. Shape (n,).
-    """
-
-    first: Array
-    last: Array
+    first: Array  # joint positions at the start, (n,)
+    last: Array  # and at the end
     first_rates: Array
     last_rates: Array
-    rests: tuple[bool, bool]
-    base: Array
-    joined: bool
-    start: Array
+    rests: tuple[bool, bool]  # whether all joints are at rest at the start, and at the end
+    base: Array  # configuration of the base at the start; its guess where it is free
+    joined: bool  # whether joints or base continue from another phase
+    start: Array  # joint positions at the start of the guess, (n,)
 
     @classmethod
     def checked(
@@ -236,9 +227,7 @@ def _declare_motion(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return positions or velocities that a user gives for one end of a motion as numbers (n,), nan where free; raise
-    ProblemError if the size is wrong or a number infinite.
-    """
+    """Return positions or velocities given for one end as numbers (n,), nan where free, or raise ProblemError."""
     if value is None:
         return np.full(n, np.nan)
     with suppress(*NOT_NUMBERS):
@@ -249,9 +238,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scales for the solver of the angles, speeds, accelerations and jerks of reaction wheels, nan for other
-    joints. Shape (4, n).
-    """
+    """Return scales (4, n) of angles, speeds, accelerations and jerks of reaction wheels, nan for other joints."""
     # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():

@@ -1,15 +1,11 @@
-"""Planners of motions to one or several goals within actuator limits: they solve a problem and audit the plan.
+"""Motions to several goals within actuator limits, and the solver of plans that satisfy their limits between the nodes.
 
-A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
-plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
-between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined
-where the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
+A smooth plan of least effort needs few intervals. A plan of least time switches from limit to limit and gets nodes at
+its switches. Where a limit is still exceeded between the nodes, it is tightened there (`ocp.tightening`). If that costs
+too much, the mesh is refined there: the excess of a smooth plan decreases with the square of the interval.
 
-A motion to several goals may pick up and put down loads there. The motion to each goal is a phase with its own machine,
-declared by `dynamics_problem`. Joints and base are continuous between phases, so are the velocities if the machine does
-not stop there, and the accelerations if the jerk is the control. A load changes the machine and is picked
-up or put down at rest only: then the momentum is zero before and after. Grasping a moving load is an impact with a
-velocity jump; it needs a join of `Phases` declared by hand.
+The motion to each goal is a phase with its own machine. A load is picked up or put down at rest only: then the momentum
+is zero before and after. Grasping a moving load is an impact; it needs a join of `Phases` declared by hand.
 """
 
 from __future__ import annotations
@@ -112,11 +108,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Return goals as a tuple after checking that one problem, with a phase for each goal, can reach them one by one.
-
-    Raises:
-        ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
-    """
+    """Return goals as a tuple; raise ProblemError unless one problem with a phase for each can reach them."""
     checked = tuple(require.each("goals", goals, Goal))
     if not checked:
         raise ProblemError("goals: at least one is needed", name="goals", value=goals)
@@ -204,20 +196,11 @@ MESH_SETTINGS = MeshSettings()
 
 @dataclass(frozen=True, eq=False)
 class SolveSettings:
-    """Settings of a solve that is audited and, if the audit fails, repeated on finer meshes.
+    """Settings of a solve that is audited and, if the audit fails, repeated on finer meshes."""
 
-    Attributes:
-        method: First mesh; None for that of the planner.
-        options: IPOPT options.
-        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
-
-    Raises:
-        ProblemError: The method is no collocation, or the options are no mapping.
-    """
-
-    method: Collocation | None = None
-    options: Mapping[str, Any] | None = None
-    tolerances: Mapping[str, float] | None = None
+    method: Collocation | None = None  # first mesh; None for that of the planner
+    options: Mapping[str, Any] | None = None  # of IPOPT
+    tolerances: Mapping[str, float] | None = None  # of the audit by name, see `ocp.audit.audit.audit`
 
     def __post_init__(self) -> None:
         if self.method is not None:
@@ -329,7 +312,8 @@ def within_limits(
 ) -> Solution:
     """Solve a problem on finer and finer meshes until a plan passes its audit and satisfies its limits everywhere.
 
-    Limits are satisfied between the mesh nodes, too; see `solve_dynamics`.
+    The limits hold between the nodes, too, to 1e-5 of their units. If no plan passes, the feasible plan of least cost
+    is returned; its optimality is then undetermined, or it costs too much, by about its `tightening_cost`.
 
     Args:
         declare: Declares the problem under clearance constraints.
@@ -337,6 +321,9 @@ def within_limits(
         breaks: Fractions of the horizon that get nodes.
         settings: First mesh, solver options and audit tolerances.
         guess: Guess of the first solve; that of the problem if None.
+
+    Raises:
+        SolveError: No plan satisfies its limits; the message has the result of each attempt.
     """
     own = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     mesh = (own.method or POINTS).with_nodes_at(breaks)
@@ -369,9 +356,8 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Solve a problem on finer and finer meshes; return the first plan within its limits that passes its audit, or else
-    the feasible one of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a
-    plan.
+    """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
+    of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin

@@ -51,16 +51,7 @@ def joint_motion_problem(
     """Declare the optimal control problem of least squared joint rates or least path length between two configurations.
 
     The state is "joints", the control "rates". With weights w and rates u the cost is the integral of sum(w u^2) / 2,
-    or the length in joint space, the integral of sqrt(sum(w u^2)).
-
-    Args:
-        machine: Machine on a fixed base.
-        horizon: Final time, s.
-        start, end: Configurations, rad or m. Shape (n,).
-        limits: Limits of joint positions and rates; the robot's own if None.
-        weights: Weights of the squared rates, shape (n,); all 1 if None.
-        length: Whether the length is the cost.
-        clearance_constraints: Collision avoidance; None for none.
+    or with `length` the length in joint space, the integral of sqrt(sum(w u^2)).
 
     Raises:
         ProblemError: Sizes do not match, or an end is outside the limits.
@@ -90,17 +81,10 @@ def joint_motion_problem(
 
 
 def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *, length: bool) -> Solution:
-    """Return the motion at constant speed along a joint path in the form of a solution of a `joint_motion_problem`.
+    """Return the motion at constant speed along a joint path (M, n) as a solution of a `joint_motion_problem`.
 
-    A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible.
-
-    Args:
-        problem: The problem.
-        path: Configurations with straight motions between them, the first and the last one those of the problem. Shape
-            (M, n).
-        scale: The length of a displacement is |scale * dq|, the roots of the weights. Shape (n,).
-        horizon: Final time, s.
-        length: Whether the length is the cost.
+    A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible. The
+    length of a displacement is |scale * dq|, with the roots (n,) of the weights.
     """
     changes = np.diff(path, axis=0)
     lengths = np.linalg.norm(changes * scale, axis=1)

@@ -105,11 +105,7 @@ class TimingProblem:
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
-        """Return the speed profile of a solution, with constant jerk in each interval.
-
-        Raises:
-            ProblemError: The jerk of the solution is not constant in its intervals.
-        """
+        """Return the speed profile of a solution, with constant jerk in each interval."""
         curve = solution.control_interpolant
         if curve.values.shape[1] != 1:
             message = "the jerk of this solution is not constant in its intervals; solve with control='held'"
@@ -136,19 +132,12 @@ class TimingProblem:
 
 @dataclass(frozen=True, eq=False)
 class FastestMotion:
-    """FastestMotion motion along a path, with its minimum-time problem and solution.
+    """FastestMotion motion along a path, with its minimum-time problem and solution."""
 
-    Attributes:
-        schedule: Motion as from ocp.motion.schedule, without a list of dips.
-        solution: Solution on the last mesh.
-        timing: Problem with that mesh.
-        demand: Largest ratio of a limited quantity to its limit, on a grid ten times finer.
-    """
-
-    schedule: Schedule
-    solution: Solution
-    timing: TimingProblem
-    demand: float
+    schedule: Schedule  # motion as from ocp.motion.schedule, without a list of dips
+    solution: Solution  # on the last mesh
+    timing: TimingProblem  # problem with that mesh
+    demand: float  # largest ratio of a limited quantity to its limit, on a grid ten times finer
 
     @property
     def duration(self) -> float:
@@ -266,9 +255,7 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units; `along` is the
-    function of theta that returns the reference speed and the values of `path_columns`.
-    """
+    """Declare the minimum-time problem over theta in scaled units; `along` gives `path_columns` and their speed."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -401,12 +388,9 @@ def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature, and first three derivatives of the joint positions at distances (M,) along a path.
+    """Return speed limit, curvature and three derivatives of the joints at distances (M,). Shape (M, C).
 
-    The curvature is zero if the centripetal acceleration is not limited. Shape (M, C).
-
-    Raises:
-        ProblemError: A curvature or a joint is not finite, or the joints have a wrong shape.
+    The curvature is zero if the centripetal acceleration is not limited.
     """
     limited = np.isfinite(limits.centripetal)
     columns = [speed_limit(path, limits, s), curvature_along(path, s) if limited else np.zeros(len(s))]
@@ -417,10 +401,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of a limited quantity to its limit at each sample of a motion along a path. Shape (M,).
-
-    Torques are not among the quantities. Where the path's derivatives jump, the values after the jump count.
-    """
+    """Return the largest ratio of a limited quantity but a torque to its limit at M samples. Shape (M,)."""
     usage = np.abs(limit_rows(path, limits, joints, motion.distance, torques=False).usage(motion))
     usage[:, 0] **= 2  # the speed at the centripetal limit, of which the acceleration is the square
     return np.asarray(np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1)))
@@ -470,11 +451,8 @@ def distinct(values: Array, tolerance: float) -> Array:
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
     """Return the mesh nodes of the minimum-time problem as fractions of its horizon.
 
-    Args:
-        reference: Reference motion; the changes of its jerk become nodes.
-        joins: Times at which the path's derivatives jump; nodes are placed on both sides. Shape (B,), s.
-        span: Start and end of the problem in the time of the reference motion, s.
-        intervals: Least number of intervals over the whole time.
+    Nodes are at the changes of jerk of the reference motion, and on both sides of the joins (B,), s, at which the
+    path's derivatives jump. The whole time has at least the given number of intervals.
     """
     whole, (begin, end) = reference.duration, span
     beside = TABLES.beside_jump * whole

@@ -59,26 +59,16 @@ FEEDBACK = FeedbackSettings()
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Interval of the horizon in which the same tasks are active.
+    """Interval of the horizon in which the same tasks are active."""
 
-    Attributes:
-        begin, end: Start and end time, s.
-        tasks: Indices of the active tasks.
-        equations: Their equations; None if there are none and the machine is free.
-        new: Whether each of these tasks begins here. Shape (len(tasks),).
-        breaks: Times between begin and end at which the tasks are less smooth. Shape (k,), s.
-        nodes: Those of them at which a mesh needs nodes so that joint rates can do the tasks. Shape (j,), s.
-        suffix: Suffix of the names of its states and controls.
-    """
-
-    begin: float
-    end: float
-    tasks: tuple[int, ...]
-    equations: TaskEquations | None
-    new: tuple[bool, ...]
-    breaks: Array
-    nodes: Array
-    suffix: str
+    begin: float  # s
+    end: float  # s
+    tasks: tuple[int, ...]  # indices of the active tasks
+    equations: TaskEquations | None  # of these tasks; None if there are none and the machine is free
+    new: tuple[bool, ...]  # whether each of these tasks begins here
+    breaks: Array  # times between begin and end at which the tasks are less smooth, (k,), s
+    nodes: Array  # those of them at which a mesh needs nodes so that joint rates can do the tasks, (j,), s
+    suffix: str  # of the names of its states and controls
 
     @property
     def duration(self) -> float:
@@ -88,19 +78,12 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active.
+    """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active."""
 
-    Attributes:
-        problem: Problem with states "joints" and, on a floating base, "base", and controls "rates", with suffixes.
-        stretches: Consecutive stretches.
-        horizon: Horizon of the motion and of the problem, s.
-        breaks: Fractions 0..1 of the horizon at which a mesh should have nodes. Shape (k,).
-    """
-
-    problem: Problem
+    problem: Problem  # with states "joints" and, on a floating base, "base", and controls "rates", with suffixes
     stretches: tuple[Stretch, ...]
-    horizon: float
-    breaks: Array
+    horizon: float  # of the motion and of the problem, s
+    breaks: Array  # fractions of the horizon at which a mesh should have nodes, (k,)
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
         """Return initial guesses of states and controls, by name, from the resolved-rate motion with index `number`."""
@@ -199,11 +182,6 @@ class ToolMotionSetup:
 
 def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
     """Declare the optimal control problem of performing tasks with the least integral of weighted squared joint rates.
-
-    Args:
-        machine: Machine on a fixed or floating base.
-        stretches: Stretches of the horizon, see `stretches_of`.
-        setup: Boundary conditions, cost, limits and formulation.
 
     Raises:
         ProblemError: A cyclic motion has a task that is not closed, or several stretches with a task in the last; a
@@ -475,8 +453,8 @@ def _declare_tasks(
 
 
 def _pose_jacobian(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the Jacobian of task poses with respect to base and joint positions at a random configuration, at which
-    its rank is that of almost all configurations. Shape (size, base_size + joint_size).
+    """Return the Jacobian (size, base_size + joint_size) of task poses at a random configuration, at which its rank is
+    that of almost all configurations.
     """
     equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))

@@ -113,20 +113,14 @@ def checked_motors(name: str, machine: Any) -> Motors:
 
 @dataclass(frozen=True, eq=False)
 class Actuation:
-    """Options of a motion controlled by joint accelerations, or by jerks if jerks are limited or weighted in the cost.
+    """Options of a motion controlled by joint accelerations, or by jerks if these are limited or weighted."""
 
-    Attributes:
-        cost: Weights of all terms but the time; None for half the squared rates.
-        rests: Whether the joints are at rest at the start and at the end; else they are free to move there.
-        end_rows: Rows (k, n) that make the product with the velocities zero at an end at rest; None: all velocities are
-            zero. Where tasks bring the tip to rest, rows for the other directions avoid dependent constraints.
-        smoothing: Duration in which a control passes from limit to limit instead of jumping, as a share of the horizon.
-            A small term of the cost, half the squared accelerations or jerks, smooths them.
-    """
-
-    cost: Cost | None = None
+    cost: Cost | None = None  # weights of all terms but the time; None for half the squared rates
+    # whether the joints are at rest at the start and at the end; else they are free to move there
     rests: tuple[bool, bool] = (False, False)
+    # rows (k, n) of the velocities that are zero at an end at rest, None for all: tasks may bring the tip to rest
     end_rows: Any = None
+    # duration in which a control passes from limit to limit by a term of the cost, as a share of the horizon
     smoothing: float = 1e-3
 
 
@@ -147,11 +141,8 @@ def declare_actuators(
     "power" where these are limited or weighted.
 
     Args:
-        problem: Problem with a horizon.
-        machine: The machine.
         horizon: Horizon of the problem, s.
         place: Base configuration and joint positions as symbols.
-        bounds: Limits of the joints and of the actuators.
         actuation: Cost, smoothness, and whether the joints are at rest where these states start and end.
         pace: Seconds of the motion in a second of the problem.
         suffix: Suffix of the declared names.
@@ -196,14 +187,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the cost per second of a motion, without the terms of duration and positive power, as an expression.
-
-    Args:
-        machine: The machine.
-        cost: Weights of the cost.
-        motion: Base configuration, joint positions, rates and accelerations as symbols.
-        jerks, torques: Used if they are weighted. Shape (n, 1).
-    """
+    """Return the cost per second of a motion, without the terms of duration and positive power, as an expression."""
     (base, joints, rates, second), n = motion, machine.joint_size
     running = ca.dot(
         ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
@@ -227,8 +211,7 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
 def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, *, suffix: str = "") -> Any:
     """Declare the limits of the actuators' powers, W, and return the cost per second of the positive power.
 
-    The path constraint "power" limits them. If the cost weights energy, the positive power of each joint is a limited
-    control of this name, because the cost needs it.
+    If the cost weights energy, the positive power of each joint is a control of this name, because the cost needs it.
     """
     if not cost.energy:
         if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():

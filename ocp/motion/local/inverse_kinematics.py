@@ -249,9 +249,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, if there is a solver of these, and how many random guesses to
-        add.
-        """
+        """Return IK solutions (K, n) on all branches, if a solver lists these, and how many random guesses to add."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count

@@ -68,7 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text; `pose` and `velocity` are time units of both kinds of tasks."""
+        """Return the units of the task equations as text, with given time units of pose and of velocity tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []

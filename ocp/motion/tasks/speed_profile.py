@@ -207,7 +207,7 @@ def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Return the shortest time (s) in which the speed changes by `change` (m/s), with zero acceleration at both ends."""
+    """Return the shortest time (s) in which the speed changes by `change` (m/s), from and to zero acceleration."""
     require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
         require.positive(f"ramp: {name}", value)
@@ -224,7 +224,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) that is reached over a distance (m), the inverse of ramp_distance."""
+    """Return the greatest speed (m/s) reached over a distance (m); it is the inverse of ramp_distance."""
     # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
     # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)

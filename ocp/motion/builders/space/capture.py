@@ -5,15 +5,10 @@ Chaser and target both float. The target has no joints and no external forces ac
 
     R' = [R I^-1 R^T L x] R,    c' = P / m,
 
-and its tip is the grasped frame. The chaser's tip reaches that frame with the same twist, at a time that may be free.
-From then on both are one machine, with the target a link on the chaser's tip. Base and joints are continuous, and the
-momentum is that of both (`space.pair`), a constant known in advance. At the end neither joints nor base turn. The
-wheels then hold the momentum, and must be able to (`ocp.motion.builders.space.pair`). Rest is relative to the centre
-of mass of the pair, which moves on at P / m.
-
-Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives together, but without wheels:
-there the chaser's momentum, `conserved_momentum` here, cancels that of the target. `chained_capture` plans each phase
-at its own least effort, one after the other.
+and its tip is the grasped frame, which the chaser's tip reaches with the same twist. From then on both are one machine,
+with their total momentum. At the end neither joints nor base turn, relative to the centre of mass of the pair, and the
+wheels hold the momentum. Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives
+together, but without wheels: there the chaser's momentum cancels that of the target.
 """
 
 from __future__ import annotations
@@ -214,17 +209,10 @@ def solve_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Plan the capture of a tumbling body within limits at the least total cost, and audit the plan.
+    """Solve `capture_problem` within its limits everywhere, and audit the plan.
 
-    The problem is `capture_problem`. The plan satisfies its limits between the nodes of the mesh, too.
-
-    Args:
-        chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
-        method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 if None.
-        tolerances: Tolerances of the audit by name.
-
-    Returns:
-        The solution; its phases are "approach" and "detumble".
+    `method` is the first mesh of both phases, with controls at the points. The phases of the solution are "approach"
+    and "detumble".
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -288,11 +276,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases of a capture: the chaser alone, and the chaser and its target as one machine.
-
-    Raises:
-        ProblemError: As `capture_problem`.
-    """
+    """Return the machines of both phases of a capture: the chaser, and chaser and target as one machine."""
     return chaser, replace(chaser, robot=checked_pair(chaser, target))
 
 
@@ -425,8 +409,8 @@ class _Capture:
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
         """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
 
-        The dynamics conserve the position of the centre of mass and the norm of the quaternion. Their continuity would
-        be a condition that no control influences, and would leave the second-order conditions undetermined.
+        The dynamics conserve this motion and the norm of the quaternion. Their continuity would be a condition that no
+        control influences, and would leave the second-order conditions undetermined.
         """
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
         attitude = _of_unit_length(chaser, base)[size:]

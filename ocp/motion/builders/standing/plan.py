@@ -1,12 +1,9 @@
 """Planners of the motions and footsteps of standing machines: they solve a problem and audit the plan.
 
-`solve_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
-
 `solve_steps` first checks on a coarse mesh whether the steps are possible in their durations, because a solver may
 search long for steps that are too fast. With durations that may grow, at a price that outweighs the rest of the cost, a
-solution nearly always exists: with the requested durations if possible, else with the least extension. A few intervals
-give the durations to a percent or two. The solution is a local minimum, hence no proof. Steps are therefore refused
-only if a solve with the requested durations fails, too. Otherwise the coarse solution is the guess.
+solution nearly always exists. It is a local minimum, hence no proof: steps are refused only if a solve with the
+requested durations fails, too. Otherwise the coarse solution is the guess.
 """
 
 from __future__ import annotations
@@ -66,10 +63,6 @@ def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
     """Solve a footstep motion in the requested durations on a coarse mesh, as an initial guess; return None on failure.
-
-    Args:
-        step_options: Cost and limits of steps_problem.
-        options: IPOPT options.
 
     Raises:
         SolveError: The quickest steps take longer than requested, and no steps in the requested durations were found:
@@ -206,19 +199,12 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 @dataclass(frozen=True)
 class Attempt:
-    """Result of one solve with a certain formulation and mesh.
+    """Result of one solve with a certain formulation and mesh."""
 
-    Attributes:
-        name: Formulation, mesh, and whether bounds were tightened.
-        solution: Plan, or last iterate; None if there is neither.
-        failure: Reason why the solution is no plan; None if it is one.
-        exceeded: Whether its only failures are inequalities exceeded between the points of the grid.
-    """
-
-    name: str
-    solution: Solution | None
-    failure: SolveError | None = None
-    exceeded: bool = False
+    name: str  # formulation, mesh, and whether bounds were tightened
+    solution: Solution | None  # plan, or last iterate
+    failure: SolveError | None = None  # reason why the solution is no plan
+    exceeded: bool = False  # whether its only failures are inequalities exceeded between the points of the grid
 
 
 @interruptible
@@ -233,21 +219,14 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Plan a motion of a standing machine; try several formulations until the audit accepts a plan.
+    """Solve several formulations of `standing_problem` until the audit accepts a plan of a standing machine.
 
-    The problem is `standing_problem`. The first plan that passes its audit with pose errors below 1e-5 (m, rad)
-    everywhere is returned. Accelerations at the collocation points are tried first, or, if the final time is free,
-    accelerations linear between the nodes. Jerks are at the points. If the only failures of a plan are limits exceeded
-    between the points, they are tightened there. Other plans are solved again from themselves on up to two meshes, each
-    twice as fine.
+    The first plan that passes its audit with pose errors below 1e-5 (m, rad) everywhere is returned. Accelerations at
+    the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
+    are at the points. If the only failures of a plan are limits exceeded between the points, they are tightened there.
+    Other plans are solved again from themselves on up to two meshes, each twice as fine.
 
-    Args:
-        machine, tasks, horizon, start, weights, limits: As for `standing_problem`; the rule for the zero moment point
-            is that of the limits.
-        setup: As for `standing_problem`, but `tip_level` is chosen here. If bodies collide, they are separated by
-            constraints and the motion is planned again.
-        settings: First mesh, solver options and audit tolerances. The `control` of a given mesh selects the only
-            formulation that is tried.
+    The `tip_level` of the setup is chosen here, and the `control` of a given mesh selects the only formulation tried.
 
     Raises:
         SolveError: No attempt passes. The message has the result of each; the fields are those of the last failure.
@@ -286,17 +265,10 @@ def solve_steps(
     cost: StepWeights | None = None,
     limits: Limits | None = None,
 ) -> Solution:
-    """Plan the footsteps of a legged machine and audit the plan; refine the mesh until a plan is feasible.
+    """Plan the footsteps of `steps_problem` and audit the plan; refine the mesh until a plan is feasible.
 
-    The problem is `steps_problem`. Limits are tightened and meshes refined as in `solve_standing`. The audit of the
-    plan may leave its optimality undetermined. First a coarse mesh shows whether the steps are possible in their
-    durations.
-
-    Args:
-        steps, start, cost, limits: As for `steps_problem`.
-        method: First mesh of each phase; 12 intervals of degree 3 if None.
-        options, tolerances: As for `solve_standing`.
-        time_limit: Seconds after which the planner stops, between two iterations of a solver. None for no limit.
+    The audit may leave the optimality of the plan undetermined. After `time_limit` seconds the planner stops, between
+    two iterations of a solver.
 
     Raises:
         SolveError: The quickest steps take longer than requested; names the phase and its duration. Or no steps exist
@@ -373,7 +345,7 @@ def _attempts(
     *,
     diagnosed: bool,
 ) -> Iterator[Attempt]:
-    """Solve one formulation on finer and finer meshes and yield each attempt; the caller stops at an accepted one.
+    """Yield attempts with one formulation on finer and finer meshes; the caller stops at an accepted one.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
@@ -397,9 +369,7 @@ def _label_of_level(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Callable that runs a solver, audits the resulting plan, and accepts or rejects it; `pose_error` rejects plans
-    that pass their audit but leave their tasks.
-    """
+    """Callable that runs a solver and audits the plan; `pose_error` rejects plans that pass but leave their tasks."""
 
     tolerances: Mapping[str, float] | None
     pose_error: Callable[[Audit], SolveError | None]

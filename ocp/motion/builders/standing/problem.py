@@ -1,28 +1,9 @@
 """Least-cost motions of a machine that stands on the ground, performs tasks with its tips, and must not tip over.
 
 This is the planned counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial,
-and any tasks: positions, orientations, free tool axes, several arms. Joint accelerations (or jerks) are the control.
-The tips are kept to their tasks in one of two ways:
-
-tip_level "position": for controls held over intervals or linear in them, that is `MultipleShooting(...,
-    control="held")` or `"linear"`, and `Collocation(..., control="held")`. The tip is on its path at the nodes. Loads
-    of ground and joints are constrained at both ends of every interval, a pinned zero moment point at the start of
-    every interval. Held controls converge with first order in the interval where a constraint of the ground is active.
-    The audit then finds the motion feasible, but its cost above the tolerance for an optimum. Linear controls are
-    closer to plans that switch; solve with `ocp.tighten`.
-tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
-    tip's acceleration is that of the path, and its position follows as accurately as the dynamics are integrated. For
-    the same number of intervals it is much closer to the optimum, and certified by the audit. Choose it where prismatic
-    joints move the tip along straight lines: with "position" the tip oscillates between the nodes there, or does not
-    come to rest on the grid (try one interval more). It does not suit plans that switch, such as those of least time,
-    since the polynomials oscillate within an interval that contains a switch.
-
-Limits hold at the points of the grid; `ocp.tighten(problem, method)` instead of `solve` enforces those of joints and
-ground between the points as well. With a fine enough grid both ways keep the tip within 1e-5 m of its path between the
-points: 40 intervals for collocation and 80 for held controls in the paper's tasks. A zero moment point that is pinned
-or follows a reference is then within 1 mm of it with "acceleration", and with "position" if the jerk is the control.
-With held accelerations it deviates by 5 mm, because it jumps with them. `ocp.motion.builders.standing.plan` chooses
-among all this.
+and any tasks. Joint accelerations (or jerks) are the control. Limits hold at the points of the grid;
+`ocp.tighten(problem, method)` instead of `solve` enforces those of joints and ground between the points as well.
+`ocp.motion.builders.standing.plan` chooses formulation and mesh.
 """
 
 from __future__ import annotations
@@ -96,6 +77,17 @@ class Weights:
 @dataclass(frozen=True, eq=False)
 class StandingSetup:
     """Settings of `standing_problem` that most motions leave at their defaults.
+
+    With tip_level "position" the tip is on its path at the nodes. It suits controls held over intervals or linear in
+    them, `MultipleShooting(..., control="held")` or `"linear"`, as in plans that switch. Held controls converge with
+    first order in the interval where a constraint of the ground is active: the audit finds the motion feasible, but its
+    cost above the tolerance for an optimum.
+
+    With tip_level "acceleration" the tip's acceleration is that of the path, and its position follows as accurately as
+    the dynamics are integrated. It suits controls at the points of `Collocation(...)`, Legendre rather than Radau, is
+    much closer to the optimum for the same number of intervals, and is certified by the audit. Choose it where
+    prismatic joints move the tip along straight lines, between whose nodes the tip oscillates with "position". It does
+    not suit plans that switch: polynomials oscillate within an interval that contains a switch.
 
     Attributes:
         start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
@@ -316,13 +308,8 @@ def declare_joints(
 ) -> tuple[Any, Any, Any, Any]:
     """Declare joint positions, velocities and accelerations within limits, and jerks if `jerk`; return the symbols.
 
-    The last of these quantities is the control, the others are states, whose derivatives are declared.
-
-    Args:
-        problem, robot, bounds: Problem, robot, and the limits of its joints.
-        guess: Guesses by the names "joints", "velocities" and "accelerations".
-        starts, ends: Positions, velocities and accelerations at both ends of the motion; None, or nan, where free.
-        scales: Scales of the four quantities for the solver.
+    The last of these quantities is the control, the others are states, whose derivatives are declared. `starts` and
+    `ends` are their values at both ends, None or nan where free, `scales` those for the solver.
     """
     lower = (bounds.lower, -bounds.velocity, -bounds.acceleration, -bounds.jerk)
     upper = (bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk)

@@ -155,13 +155,9 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return, by name, the quantities of `StepsMotion` along a motion in one stance: torques, loads and margins.
+    """Return, by name, the quantities (M, ...) of `StepsMotion` along a motion in one stance.
 
-    Shape (M, ...) each.
-
-    Args:
-        motion: Joint positions, velocities and accelerations in the stance's joint order. Shape (M, n) each.
-        foot_loads: Components `Stance.load_rows` of the loads of the feet besides the first. Shape (M, k) each.
+    The motion and the loads of all feet but the first, in the rows `Stance.load_rows`, are in the stance's joint order.
     """
     q, qd, qdd = motion
     function, names = _stance_function(steps, stance)
@@ -186,8 +182,8 @@ def sample_stance(
 
 
 def _stance_function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
-    """Return a casadi Function from joint positions, velocities, accelerations and the loads of all feet but the first
-    to torques, loads and frames in a stance, and the names of its outputs.
+    """Return a casadi Function from joint motion and loads of all feet but the first to torques, loads and frames in a
+    stance, and the names of its outputs.
     """
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
@@ -243,9 +239,7 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
 
 
 def _resolve_phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
-    """Return the resolved-rate motion in phase k of footsteps: joint positions, rates and accelerations in the joint
-    order of the stance. Shape (M, n) each.
-    """
+    """Return the resolved-rate motion in phase k: joint positions, rates and accelerations, in the stance's order."""
     stance = steps.stances[k]
     swings = [swing for swing in steps.swings(k) if swing.lifted is not None and swing.landing is not None]
     if not swings:
@@ -288,9 +282,7 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return the loads of all feet but the first, in the rows `Stance.load_rows`, for which the sum of the squared
-    loads of all feet is least. Shape (M, k) each.
-    """
+    """Return the loads (M, k) of all feet but the first for which the sum of the squared loads of all feet is least."""
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:
         return {}

@@ -44,11 +44,7 @@ STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """Return the start configuration; a joint that exceeds a limit only by rounding is set to the limit. Shape (n,).
-
-    Raises:
-        ProblemError: A joint starts outside its limits, or has no range between them.
-    """
+    """Return the start configuration (n,); a joint that exceeds a limit only by rounding is set to the limit."""
     for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
@@ -60,11 +56,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than the machine has.
-
-    Args:
-        size: Number of rows of all tasks.
-    """
+    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than there are."""
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
     left = machine.joint_size - (size + pinned - along_parameter)
     follows = tip_level == "acceleration" and not pinned  # the joints come to rest with the tip
@@ -100,15 +92,10 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError if no joint accelerations satisfy the limits of torque and ground reaction at the start.
+    """Raise ProblemError if no joint accelerations from rest satisfy the limits of torque and ground reaction.
 
-    The machine starts from rest. Torques, vertical force and zero moment point are linear in the accelerations. A
-    linear program finds the least violation.
-
-    Args:
-        machine, joints, wrenches: Machine, configuration and external wrenches at the start.
-        zmp, least_force, bounds: Limits, see standing_problem.
-        demand: Matrix T and vector a of the tasks' equations T q'' = a of the accelerations q''; None without tasks.
+    Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
+    violation. `demand` has matrix T and vector a of the tasks' equations T q'' = a of the accelerations q''.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)
     qdd = ca.SX.sym("qdd", n)

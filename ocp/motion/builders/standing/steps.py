@@ -1,17 +1,12 @@
 """Least-cost motions of machines whose support changes, such as walking legs or docking bases.
 
-A motion is a sequence of stances (`models.machines.stance`), one phase each. Joints and velocities are continuous
-between phases. A held foot does not move: its acceleration is zero, with position errors fed back. The load of each
-held foot but the first is a control. The first foot, at which the machine is rooted, bears the rest,
+A motion is a sequence of stances (`models.machines.stance`), one phase each. A held foot does not move: its
+acceleration is zero, with position errors fed back. The load of each held foot but the first is a control. The first
+foot, at which the machine is rooted, bears the rest: rate of momentum = weight + sum of loads (Newton-Euler). Each load
+must press on its own sole, in it, and lie in the friction cone. So the zero moment point lies in the hull of the held
+soles, and the distribution of the load is part of the plan. A foot lands at rest, without an impact.
 
-    rate of momentum = weight + sum of loads (Newton-Euler).
-
-Each load must press on its own sole, its center of pressure must lie in the sole, and it must lie in the friction cone.
-So the zero moment point lies in the hull of the held soles, and the distribution of the load is part of the plan. A
-foot lands at rest on its foothold, without an impact. Its sole stays above the ground from lifting to landing.
-
-With balance "static" the center of mass, too, stays over the support, the hull of the held soles. The machine can then
-be stopped softly anywhere: quasi-static steps.
+With balance "static" the center of mass, too, stays over the support: the machine can be stopped softly anywhere.
 """
 
 from __future__ import annotations
