@@ -19,7 +19,7 @@ from models.checks import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
-from ocp.motion.local.ik_solver import ik_branches, joint_range
+from ocp.motion.local.ik_solver import ik_branches, joint_range, sampling_range
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
@@ -31,7 +31,6 @@ LARGEST_SEED = 2**64
 class IkSettings:
     """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions."""
 
-    slide_spread: float = 1.0  # range of the starts of prismatic joints without limits, m
     first_damping: float = 1e-2  # damping of the first step
     least_damping: float = 1e-12  # least damping
     most_damping: float = 1e8  # damping at which a start is abandoned
@@ -294,10 +293,8 @@ class _MultiStart:
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
     """Return initial guesses: the configurations `near`, then `count` random ones within limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
-    prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
-    span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
-    low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
-    high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
+    revolute = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
+    low, high = sampling_range(lower, upper, revolute)
     first = np.zeros((0, size)) if near is None else np.atleast_2d(require.array("near", near))
     if first.ndim != 2 or first.shape[1] != size:
         words = f"near has shape {first.shape}, ({size},) or (k, {size}) of finite numbers expected"

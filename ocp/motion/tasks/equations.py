@@ -55,7 +55,7 @@ class TaskEquations:
     @property
     def pose_rows(self) -> NDArray[np.bool_]:
         """Mask of the task equations that belong to pose tasks, not to velocity tasks. Shape (size,), bool."""
-        return self.by_row(lambda task: task.is_pose)
+        return np.asarray(self.by_row(lambda task: task.is_pose), dtype=bool)
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
