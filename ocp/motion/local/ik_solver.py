@@ -215,9 +215,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class ArmSolver:
-    """Solver of all inverse kinematics solutions of an arm within its limits, at the orientations that a task leaves
-    free.
-    """
+    """Solver of all inverse kinematics solutions of an arm within its limits and of partly free orientations."""
 
     chain: Chain
     solvers: tuple[PoseSolver, ...]  # for several choices of the sampled joints, the best-conditioned one first
@@ -328,9 +326,7 @@ class ArmSolver:
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples (S, 3, 3) of the free rotations of the tip frame, from shares of roll, azimuth and the cone's
-        area.
-        """
+        """Return samples (S, 3, 3) of the free rotations of the tip, from shares of roll, azimuth and cone area."""
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return rolled
