@@ -29,7 +29,7 @@ from ocp.indirect.method import Indirect
 from ocp.methods import Certificate, certificate, prepare, solve
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, joint_torques
 from ocp.motion.builders.dynamics_plan import dynamics_phases
 from ocp.motion.builders.joint_motion import VelocitySetup, minimum_velocity_problem
 from ocp.motion.builders.joint_spline import joint_path
@@ -39,7 +39,6 @@ from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, st
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
-from ocp.motion.builders.torques import JointFriction, joint_torques
 from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics

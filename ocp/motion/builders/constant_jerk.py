@@ -27,7 +27,7 @@ from models import FixedBase
 from models.checks import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError, SolverStatus
-from ocp.motion.builders.torques import joint_torques
+from ocp.motion.builders.dynamics import joint_torques
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem

@@ -25,9 +25,8 @@ from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, is_clearance, solve_with_clearance
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask

@@ -22,7 +22,7 @@ from models.checks import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.torques import Actuation, declare_actuators
+from ocp.motion.builders.dynamics import Actuation, declare_actuators
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind

@@ -27,7 +27,7 @@ from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
+from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import SolveSettings, within_limits
 from ocp.motion.builders.space.pair import (
     State,
@@ -43,7 +43,6 @@ from ocp.motion.builders.space.pair import (
     wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.torques import JointFriction
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.goals import Cost, Start
 from ocp.motion.tasks.limits import Limits
