@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, 
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
@@ -69,10 +68,10 @@ def dynamics_phases(
     """
     goals = checked_goals(goals)
     setup = DynamicsSetup() if setup is None else require.instance("dynamics_phases: setup", setup, DynamicsSetup)
-    _check_end_velocity(setup)
+    if setup.end_velocity != "rest":
+        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
+        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
     clearance = setup.clearance_constraints
-    if clearance is not None:
-        require.instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
     names = phase_names(goals)
     machines, problems = machines_of(machine, goals), {}
     begin: Any = start
@@ -210,87 +209,6 @@ class SolveSettings:
     def ipopt_options(self) -> dict[str, Any]:
         """IPOPT options given by the user, completed by the defaults of the planner."""
         return {**IPOPT, **(self.options or {})}
-
-
-@interruptible
-def solve_dynamics(
-    machine: Motors,
-    tasks: TipTask | Goal | Sequence[TipTask] | Sequence[Goal],
-    horizon: float | FreeTime | None = None,
-    *,
-    start: Any,
-    limits: Limits | None = None,
-    cost: Cost | None = None,
-    setup: DynamicsSetup | None = None,
-    settings: SolveSettings | None = None,
-) -> Solution:
-    """Plan a motion within actuator limits, either along tip tasks or to one or several goals, and audit the plan.
-
-    The problem is `dynamics_problem`, or the phases of `dynamics_phases`. The plan satisfies its limits between the
-    nodes, too, to 1e-5 of their units. The first plan that passes its audit is returned. If none passes, the feasible
-    plan of least cost is returned; its optimality is then undetermined, or it costs too much, by about its
-    `tightening_cost`. Least time alone, `Cost(velocity=0, time=1)`, leaves the motion of joints that need not hurry
-    undetermined, so that the optimality is undetermined, too. Add a small weight of accelerations or torques.
-
-    Args:
-        machine, start, limits, cost, setup: As for `dynamics_problem`.
-        tasks: Tip tasks as for `dynamics_problem`; one goal, which has joints and perhaps tasks on the way; or the
-            goals of `dynamics_phases`, for which the solution has a phase each, `solution.phase(name)`. Goals give
-            their velocities themselves.
-        horizon: Final time, s, or FreeTime(...). For several goals, which have their own durations, that of all phases
-            together; None leaves it free.
-        settings: First mesh, solver options and audit tolerances. By default, 20 Legendre intervals of degree 5 with
-            nodes at the breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where
-            needed.
-
-    Raises:
-        SolveError: No plan satisfies its limits. The message has the result of each attempt, and the joint, the time
-            and the limit that is violated.
-        ProblemError: As `dynamics_problem` and `dynamics_phases`.
-    """
-    own_setup = DynamicsSetup() if setup is None else require.instance("solve_dynamics: setup", setup, DynamicsSetup)
-    shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
-    clearance, total = own_setup.clearance_constraints, cast(Any, horizon)
-    if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
-        goals = checked_goals(tasks)
-        phases = zip(phase_names(goals), machines_of(machine, goals), strict=True)
-        limited_machines = {name: (own, limits) for name, own in phases}
-
-        def declare_phases(clearance: ClearanceConstraints | None) -> Problem:
-            own = replace(own_setup, clearance_constraints=clearance)
-            return dynamics_phases(machine, goals, total=total, setup=own, **shared)
-
-        return within_limits(declare_phases, clearance, limited_machines, settings=settings)
-    if isinstance(tasks, Goal):
-        _check_end_velocity(own_setup)
-        horizon = tasks.duration if horizon is None else horizon
-        (goal,) = checked_goals([replace(tasks, duration=horizon)])
-        end_base = own_setup.end_base if goal.base is None else goal.base
-        own_setup = replace(own_setup, end_velocity=goal.velocity, end_base=end_base)
-        (machine,), shared["end"] = machines_of(machine, [goal]), goal.joints
-    tip_tasks: Any = tasks.tasks if isinstance(tasks, Goal) else tasks
-
-    def declare(clearance: ClearanceConstraints | None) -> Problem:
-        own = replace(own_setup, clearance_constraints=clearance)
-        return dynamics_problem(machine, tip_tasks, duration, setup=own, **shared)
-
-    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else require.positive("horizon", horizon)
-    at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
-    return within_limits(declare, clearance, {"": (machine, limits)}, breaks=at, settings=settings)
-
-
-def _check_end_velocity(setup: DynamicsSetup) -> None:
-    """Raise ProblemError if the setup prescribes an end velocity, because every goal states its own velocity."""
-    if setup.end_velocity != "rest":
-        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
-        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
-
-
-def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
-    """Return the times at which tasks have kinks or jumps, as fractions of the horizon."""
-    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
-    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
-    return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:

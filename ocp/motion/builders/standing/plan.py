@@ -23,7 +23,7 @@ from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
-from ocp.motion.builders.dynamics_plan import IPOPT, SolveSettings, audit_error, breaks_of
+from ocp.motion.builders.dynamics_plan import IPOPT, SolveSettings, audit_error
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -286,6 +286,13 @@ def solve_steps(
         return _first_accepted(
             lambda _: steps_problem(steps, start=start, cost=cost, limits=limits), trials, settings, judge, guess
         )
+
+
+def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
+    """Return the times at which tasks have kinks or jumps, as fractions of the horizon."""
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
+    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
+    return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def _first_accepted(
