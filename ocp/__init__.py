@@ -35,9 +35,8 @@ from ocp.motion.builders.joint_motion import VelocitySetup, minimum_velocity_pro
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_problem, chained_capture
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
-from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
-from ocp.motion.builders.standing.steps import StepWeights, steps_problem
+from ocp.motion.builders.standing.steps import StepsMotion, StepWeights, resolve_steps, steps_motion, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations

@@ -26,7 +26,7 @@ from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints, limit_torques
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
@@ -48,6 +48,7 @@ LENGTH_RATE = 1e-2
 sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 % at 0.5 rad/s, and by LENGTH_RATE at rest.
 """
 
+QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 Motors = FixedBase | FreeFloating
 """Type of the machines whose motion the joint torques alone determine."""
 
@@ -236,16 +237,6 @@ def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, 
     power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
     problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
     return cost.energy * ca.sum1(power)
-
-
-def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:
-    """Declare the torque limits of a robot's joints, where these are finite, as a path constraint."""
-    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
-        bounds = {"lower": -largest[rows], "upper": largest[rows]}
-        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
-
-
-QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
 
 @dataclass(frozen=True, eq=False)

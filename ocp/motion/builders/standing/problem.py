@@ -244,11 +244,7 @@ def standing_problem(
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _constrain_ground(problem, machine, motion, wrenches, zmp, limits)
-    effort = bounds.torque
-    if np.isfinite(effort).any():
-        limited = np.flatnonzero(np.isfinite(effort)).tolist()
-        torques = machine.joint_torques(*motion, wrenches)[limited]
-        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
+    limit_torques(problem, machine.robot, machine.joint_torques(*motion, wrenches), bounds.torque)
 
     none = ca.DM(0, 1)
     if setup.clearance_constraints is not None:
@@ -325,6 +321,13 @@ def declare_joints(
         problem.dynamics(state, derivative)
     joints, velocities, accelerations, *jerks = symbols
     return joints, velocities, accelerations, jerks[0] if jerk else ca.DM(0, 1)
+
+
+def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:
+    """Declare the torque limits of a robot's joints, where these are finite, as a path constraint."""
+    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
+        bounds = {"lower": -largest[rows], "upper": largest[rows]}
+        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
 
 
 def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:

@@ -16,9 +16,16 @@ import pytest
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
 from ocp import Collocation, Limits, ProblemError, Solution, SolveError, solve
 from ocp.motion.builders.standing.plan import guess_in_time, solve_steps
-from ocp.motion.builders.standing.resolved import StepsMotion, motion_of, resolve_steps, sample_stance, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
-from ocp.motion.builders.standing.steps import StepWeights, steps_problem
+from ocp.motion.builders.standing.steps import (
+    StepsMotion,
+    StepWeights,
+    motion_of,
+    resolve_steps,
+    sample_stance,
+    steps_motion,
+    steps_problem,
+)
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, crouched, planar_biped, planar_feet, planar_steps
 from scripts.robots.talos import talos_steps
@@ -266,8 +273,8 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     configuration = standing_configuration(stance, crouched(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
     still = np.zeros_like(configuration)
     one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
-    result = sample_stance(one, one.stances[0], (configuration, still, still), {})
-    return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **result}])
+    motion = (configuration, still, still)
+    return motion_of(one, [sample_stance(one, 0, np.array([0.0, seconds]), motion, foot_loads={})])
 
 
 @pytest.mark.long
