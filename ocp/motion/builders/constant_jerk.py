@@ -151,44 +151,58 @@ class ConstantJerkMotion:
         form, horizon = Formulation.of(problem), self.duration
         breaks = np.append(0.0, np.cumsum(self.durations)) / horizon
         breaks[-1] = 1.0
-        curves = dict(zip(("joints", "velocities", "accelerations"), self.sampled(NODES), strict=True))
-        states = np.concatenate([curves[name] for name in form.states], axis=2)
+        samples = dict(zip(("joints", "velocities", "accelerations"), self.sampled(NODES), strict=True))
+        states = np.concatenate([samples[name] for name in form.states], axis=2)
         constant = self.jerks if "jerks" in form.controls else self.accelerations
         state_curve = PiecewisePolynomial(breaks, NODES, states)
         control_curve = PiecewisePolynomial(breaks, np.array([0.5]), constant[:, None])
-        rows = np.concatenate([states[:, 0], states[-1:, -1]])
-        controls = np.concatenate([constant, constant[-1:]])
+        costate_curve = PiecewisePolynomial(breaks, NODES, np.zeros_like(states))
         p = form.parameter_vector({})
         nodes, weights = np.polynomial.legendre.leggauss(5)
         at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
         shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
         running = form.sampled([form.running], state_curve(at), control_curve(at), at * horizon, horizon, p)[0][:, 0]
-        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
-        columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
-        return Solution(
-            name=problem.name,
-            method={"type": method},
-            solver="path",
-            success=False,
-            status=SolverStatus.ACCEPTABLE,
-            message=f"it {method}, without multipliers that show whether it is optimal",
-            cost=float(horizon * shares @ running + final),
-            iterations=0,
-            horizon=horizon,
-            t=breaks * horizon,
-            states={name: rows[:, part] for name, part in columns.items()},
-            controls=dict.fromkeys(form.controls, controls),
-            costates={name: np.zeros_like(rows[:, part]) for name, part in columns.items()},
-            parameters={},
-            cost_gradients={},
-            state_interpolant=state_curve,
-            control_interpolant=control_curve,
-            costate_interpolant=PiecewisePolynomial(breaks, NODES, np.zeros_like(states)),
-            variables=states.ravel(),
-            multipliers=np.zeros(0),
-            seconds={"build": 0.0, "solve": 0.0},
-            problem=problem,
-        )
+        final = form.terminal_cost(states[-1, -1], states[0, 0], constant[0], horizon=horizon, p=p)
+        cost = float(horizon * shares @ running + final)
+        message = f"it {method}, without multipliers that show whether it is optimal"
+        curves = state_curve, control_curve, costate_curve
+        return path_solution(problem, method, curves, horizon=horizon, cost=cost, message=message)
+
+
+def path_solution(
+    problem: Problem, method: str, curves: tuple[PiecewisePolynomial, ...], *, horizon: float, cost: float, message: str
+) -> Solution:
+    """Return a motion that no solver computed, given by curves of states, control and costates, as a solution.
+
+    `message` says why its optimality is open; it is empty if the motion is optimal.
+    """
+    form = Formulation.of(problem)
+    columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
+    states, controls, costates = (np.concatenate([curve.values[:, 0], curve.values[-1:, -1]]) for curve in curves)
+    return Solution(
+        name=problem.name,
+        method={"type": method},
+        solver="path",
+        success=not message,
+        status=SolverStatus.ACCEPTABLE if message else SolverStatus.SOLVED,
+        message=message,
+        cost=cost,
+        iterations=0,
+        horizon=horizon,
+        t=curves[0].breaks * horizon,
+        states={name: states[:, part] for name, part in columns.items()},
+        controls=dict.fromkeys(form.controls, controls),
+        costates={name: costates[:, part] for name, part in columns.items()},
+        parameters={},
+        cost_gradients={},
+        state_interpolant=curves[0],
+        control_interpolant=curves[1],
+        costate_interpolant=curves[2],
+        variables=states.ravel(),
+        multipliers=np.zeros(0),
+        seconds={"build": 0.0, "solve": 0.0},
+        problem=problem,
+    )
 
 
 class TorqueLimits:

@@ -20,8 +20,9 @@ from models import FixedBase, Machine
 from models.checks import Array
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, SolverStatus, require
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.constant_jerk import path_solution
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import IkOptions, inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
@@ -95,37 +96,18 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     breaks = np.append(0.0, np.cumsum(shares))
     breaks[-1] = 1.0
     rates = np.diff(path, axis=0) / (np.diff(breaks)[:, None] * horizon)
-    ends, middle = np.array([0.0, 1.0]), np.array([0.5])
-    states = PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1))
-    controls, is_straight = PiecewisePolynomial(breaks, middle, rates[:, None]), len(rates) == 1
     # the costates of a motion without active constraints: minus the rate gradient of the running cost
     speeds = np.linalg.norm(rates * scale, axis=1, keepdims=True)
     duals = -(scale**2) * rates / (np.maximum(speeds, np.finfo(float).tiny) if length else 1.0)
-    costates = np.vstack([duals, duals[-1:]])
-    return Solution(
-        name=problem.name,
-        method={"type": "path at constant speed"},
-        solver="path",
-        success=is_straight,
-        status=SolverStatus.SOLVED if is_straight else SolverStatus.ACCEPTABLE,
-        message="" if is_straight else "it follows a path of straight motions, whose optimality no multipliers show",
-        cost=total if length else total**2 / (2 * horizon),
-        iterations=0,
-        horizon=horizon,
-        t=breaks * horizon,
-        states={"joints": path},
-        controls={"rates": np.vstack([rates, rates[-1:]])},
-        costates={"joints": costates},
-        parameters={},
-        cost_gradients={},
-        state_interpolant=states,
-        control_interpolant=controls,
-        costate_interpolant=PiecewisePolynomial(breaks, ends, np.stack([duals, duals], axis=1)),
-        variables=path.ravel(),
-        multipliers=np.zeros(0),
-        seconds={"build": 0.0, "solve": 0.0},
-        problem=problem,
+    ends = np.array([0.0, 1.0])
+    curves = (
+        PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1)),
+        PiecewisePolynomial(breaks, np.array([0.5]), rates[:, None]),
+        PiecewisePolynomial(breaks, ends, np.stack([duals, duals], axis=1)),
     )
+    message = "it follows a path of straight motions, whose optimality no multipliers show" if len(rates) > 1 else ""
+    cost = total if length else total**2 / (2 * horizon)
+    return path_solution(problem, "path at constant speed", curves, horizon=horizon, cost=cost, message=message)
 
 
 GUESS_STEPS = 64

@@ -27,14 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
+from models.spatial import rotation_matrices
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
 """Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
-NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
-"""Matrix that maps a vector to the entries of its cross product matrix, row by row."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
 
 
@@ -69,16 +67,6 @@ class EliminationSettings:
 ELIMINATION = EliminationSettings()
 
 
-def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of arrays of vectors along their last axis."""
-    return np.asarray(np.vecdot(a, b))
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of arrays of vectors along their last axis, faster than numpy for small arrays."""
-    return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
-
-
 def axial(turn: Array) -> Array:
     """Return the axial vectors (M, 3) of rotation matrices (M, 3, 3), which are 2 sin(angle) times the axis."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
@@ -103,9 +91,7 @@ class Axis(NamedTuple):
         """Return the rigid motions that the joint causes at joint positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
-        skew = (self.direction @ SKEW).reshape(-1, 3, 3)
-        sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
-        turn = np.eye(3) + sine * skew + versine * (skew @ skew)
+        turn = rotation_matrices(position[:, None] * self.direction)
         return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
 
 
@@ -261,8 +247,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
             cosine, sine = (part[:, None, None] for part in (np.cos(SAMPLES), np.sin(SAMPLES)))
             moved = []
             for vector in (point[:, None] - p, direction[:, None]):
-                along = dot(vector, w)[..., None] * w
-                moved.append(along + cosine * (vector - along) + sine * cross(w, vector))
+                along = np.vecdot(vector, w)[..., None] * w
+                moved.append(along + cosine * (vector - along) + sine * np.cross(w, vector))
             moved[0] = moved[0] + p
         else:
             shifts = np.tan(SAMPLES / 2)[:, None, None] * w
@@ -273,8 +259,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
         scale = np.ones(3) if axis.revolute else np.cos(SAMPLES / 2) ** 2
         weights = (scale[:, None] * weights).ravel()
         point, direction = (part.reshape(len(point), -1, 3) for part in moved)
-    square, along = dot(point, point)[..., None], dot(point, direction)[..., None]
-    parts = [np.ones_like(square), point, square, direction, along, cross(point, direction)]
+    square, along = np.vecdot(point, point)[..., None], np.vecdot(point, direction)[..., None]
+    parts = [np.ones_like(square), point, square, direction, along, np.cross(point, direction)]
     values = np.concatenate([*parts, square * direction - 2 * along * point], axis=2) * weights[:, None]
     values = values.transpose(0, 2, 1).reshape(len(point), 15, *[3] * len(axes))
     for k in range(len(axes)):
@@ -398,8 +384,8 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
             continue
         parts = []
         for vector, origin, unit in ((point - axis.point, axis.point, size), (direction, 0.0, 1.0)):
-            along = dot(vector, axis.direction)[:, None] * axis.direction
-            parts.append(((origin + along) / unit, (vector - along) / unit, cross(axis.direction, vector) / unit))
+            along = np.vecdot(vector, axis.direction)[:, None] * axis.direction
+            parts.append(((origin + along) / unit, (vector - along) / unit, np.cross(axis.direction, vector) / unit))
         constant, cosine, sine = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         columns += [sign * cosine, sine]
         constants.append(sign * constant)
@@ -410,5 +396,5 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
         for axis, part in ((x, solved[:, :2]), (y, solved[:, 2:]))
     )
     rest = x.motion(first).after(y.motion(second)).after(motion).inverse.after(goal).turn
-    last = np.arctan2(dot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
+    last = np.arctan2(np.vecdot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
     return np.column_stack([first, second, middle, last])
