@@ -282,19 +282,12 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig over time with the least integral of a cost and of the weighted squared roll rate.
+    """Return the roll of the rig at equally spaced times t, (samples,), rad, with the least integral of cost and rate.
 
-    The roll is found by dynamic programming. Shape (samples,), rad.
-
-    Args:
-        cost: Function (indices of times, rolls), both of shape (n,), that returns finite costs of shape (n,).
-        t: Equally spaced times. Shape (samples,), s.
-        lower, upper: Limits of the roll, rad. If infinite, all rolls of a turn are searched, and the roll may wind.
-        first_roll: Roll at t[0]; None leaves it free, in the turn nearest to 0.
-        rate_weight: Weight of the squared rate.
-        acceleration_weight: Weight of the squared acceleration, which a grid of rolls does not resolve. It is replaced
-            by a weight of the rate with which a change of roll in its optimal time costs the same.
-        rate_limit: rad/s; the first grid may exceed it by one step.
+    Dynamic programming minimises the integral of `cost`, a function of (indices of times, rolls), both (n,), and of the
+    weighted squared rate. A grid of rolls does not resolve accelerations. Their weight is replaced by a weight of the
+    rate with which a change of roll in its optimal time costs the same. Without limits all rolls of a turn are
+    searched, and the roll may wind. The first grid may exceed the rate limit by one step.
     """
     count, about = len(t), float(np.clip(0.0, lower, upper)) if first_roll is None else first_roll
     step = FULL_TURN / SEARCH.rolls

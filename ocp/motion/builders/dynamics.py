@@ -155,17 +155,8 @@ def declare_actuators(
     """Declare joint velocities and accelerations within actuator limits; return both and the running cost per second.
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
-    "power" where these are limited or weighted.
-
-    Args:
-        horizon: Horizon of the problem, s.
-        place: Base configuration and joint positions as symbols.
-        actuation: Cost, smoothness, and whether the joints are at rest where these states start and end.
-        pace: Seconds of the motion in a second of the problem.
-        suffix: Suffix of the declared names.
-
-    Raises:
-        ProblemError: Torques are limited or weighted, but the joint torques alone do not move the machine.
+    "power" where these are limited or weighted. `place` has base configuration and joint positions, `pace` is the
+    seconds of the motion in a second of the problem.
     """
     (base, joints), robot, n = place, machine.robot, machine.joint_size
     cost = Cost() if actuation.cost is None else actuation.cost

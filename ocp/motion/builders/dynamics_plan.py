@@ -236,8 +236,7 @@ def within_limits(
         declare: Declares the problem under clearance constraints.
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
         breaks: Fractions of the horizon that get nodes.
-        settings: First mesh, solver options and audit tolerances.
-        guess: Guess of the first solve; that of the problem if None.
+        settings, guess: First mesh, solver options and audit tolerances; guess of the first solve.
 
     Raises:
         SolveError: No plan satisfies its limits; the message has the result of each attempt.

@@ -49,8 +49,8 @@ Columns = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class TableSettings:
-    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem."""
+class TimingSettings:
+    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem and its refinement."""
 
     degree: int = 7  # degree of the polynomials of a table
     accuracy: float = 1e-8  # largest error of a tabulated quantity, relative to its largest value
@@ -60,44 +60,30 @@ class TableSettings:
     points: int = 40
     beside_jump: float = 1e-6  # distance of nodes from a jump of the path's derivatives, relative to the whole time
     same_node: float = 1e-7  # distance of nodes that count as one, relative to the whole time
-
-
-TABLES = TableSettings()
-IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
-
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Settings of the mesh refinement in `solve_minimum_time`."""
-
     demand: float = 2e-4  # largest accepted relative excess of a limit in an interval
     # largest accepted error of integration in an interval, relative to its distance and to the top speed
     defect: float = 1e-6
     parts: int = 8  # largest number of parts of an interval in one refinement
 
 
-REFINEMENT = RefinementSettings()
+TIMING = TimingSettings()
+IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 
 @dataclass(frozen=True, eq=False)
 class TimingProblem:
     """Minimum-time problem along a path, its mesh, and the reference motion whose time is the path parameter.
 
-    Attributes:
-        problem: Problem with states "speed" and "acceleration" and control "jerk" in `units`. Its time is theta less
-            the start of the span, and its cost the time, s.
-        mesh: Nodes as fractions of the horizon, among them the jumps of the path's derivatives and of the reference's
-            jerk.
-        units: Largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3.
-        reference: Motion whose time is theta.
-        span: First and last theta of the problem, s. Before and after, the jerk is constant.
+    The states are "speed" and "acceleration", the control is "jerk", in `units`. The time of the problem is theta less
+    the start of the span, and its cost the time, s.
     """
 
     problem: Problem
+    # nodes as fractions of the horizon, at the jumps of path derivatives and of the reference's jerk
     mesh: tuple[float, ...]
-    units: tuple[float, float, float]
-    reference: SpeedProfile
-    span: tuple[float, float]
+    units: tuple[float, float, float]  # largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3
+    reference: SpeedProfile  # motion whose time is theta
+    span: tuple[float, float]  # first and last theta of the problem, s; before and after, the jerk is constant
 
     @property
     def method(self) -> Collocation:
@@ -167,11 +153,9 @@ def solve_minimum_time(
         guess: Schedule of the same path to start from; planned here if None.
         intervals: Least number of intervals, besides nodes at the path's joins and the guess's changes of jerk.
         rounds: Largest number of mesh refinements where a limit is exceeded between the points.
-        options: IPOPT options.
 
     Raises:
-        ProblemError: As `minimum_time_problem`.
-        SolveError: The solver failed; names the worst residuals.
+        ProblemError, SolveError: As `minimum_time_problem`; or the solver failed, with the worst residuals.
     """
     require.count("rounds", rounds, 0)
     options = require.mapping("options", options)
@@ -326,10 +310,10 @@ def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
     error = np.maximum(
-        (demand - 1) / REFINEMENT.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / REFINEMENT.defect
+        (demand - 1) / TIMING.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / TIMING.defect
     )[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
-    return np.where(error > 1, np.minimum(parts, REFINEMENT.parts), 1)
+    return np.where(error > 1, np.minimum(parts, TIMING.parts), 1)
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
@@ -347,14 +331,14 @@ def table(columns: Columns, breaks: Array) -> Any:
 
     Intervals between `breaks` are halved as far as necessary. At a break the interval that begins there applies.
     """
-    angles = np.pi * (np.arange(TABLES.degree + 1) + 0.5) / (TABLES.degree + 1)
+    angles = np.pi * (np.arange(TIMING.degree + 1) + 0.5) / (TIMING.degree + 1)
     nodes = (1 - np.cos(angles)) / 2  # inside the interval, off the breaks
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
     finished: list[tuple[Array, Array]] = []
     scale: Array | None = None
-    for number in range(TABLES.halvings):
+    for number in range(TIMING.halvings):
         if not start.size:
             break
         places = np.concatenate([nodes, between])
@@ -363,8 +347,8 @@ def table(columns: Columns, breaks: Array) -> Any:
             scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
         coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
         error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
-        fine = (error <= TABLES.accuracy * scale).all(axis=(1, 2)) | (number == TABLES.halvings - 1)
-        fine |= width < TABLES.smallest_cell * (breaks[-1] - breaks[0])
+        fine = (error <= TIMING.accuracy * scale).all(axis=(1, 2)) | (number == TIMING.halvings - 1)
+        fine |= width < TIMING.smallest_cell * (breaks[-1] - breaks[0])
         finished.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2
         start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
@@ -373,12 +357,12 @@ def table(columns: Columns, breaks: Array) -> Any:
     order = np.argsort(starts)
     cells = cells[order]
     # a constant polynomial behind the end, which belongs to no other interval
-    cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TABLES.degree + 1, axis=1)])
+    cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TIMING.degree + 1, axis=1)])
     ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
-    knots = np.repeat(ends, TABLES.degree + 1).tolist()
+    knots = np.repeat(ends, TIMING.degree + 1).tolist()
     flat = cells.reshape(-1, cells.shape[2])
     time = ca.MX.sym("time")
-    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TABLES.degree], flat.shape[1], {"lookup_mode": ["binary"]})
+    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TIMING.degree], flat.shape[1], {"lookup_mode": ["binary"]})
     return ca.Function("along", [time], [value])
 
 
@@ -409,18 +393,18 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
     """Return the largest ratio of a limited quantity to its limit in each interval of a speed profile. Shape (K,)."""
-    inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
+    inside = (np.arange(TIMING.points) + 0.5) / TIMING.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     distance = np.clip(motion.distance, 0.0, path.length)
     demand = largest_demand(path, limits, joints, motion._replace(distance=distance))
-    return np.asarray(demand.reshape(-1, TABLES.points).max(axis=1))
+    return np.asarray(demand.reshape(-1, TIMING.points).max(axis=1))
 
 
 def _bernstein(x: Array) -> Array:
-    """Return the Bernstein polynomials of degree `TABLES.degree` at points x. Shape (len(x), degree + 1)."""
+    """Return the Bernstein polynomials of degree `TIMING.degree` at points x. Shape (len(x), degree + 1)."""
     return np.stack(
-        [comb(TABLES.degree, i) * x**i * (1 - x) ** (TABLES.degree - i) for i in range(TABLES.degree + 1)], axis=1
+        [comb(TIMING.degree, i) * x**i * (1 - x) ** (TIMING.degree - i) for i in range(TIMING.degree + 1)], axis=1
     )
 
 
@@ -455,15 +439,15 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
     path's derivatives jump. The whole time has at least the given number of intervals.
     """
     whole, (begin, end) = reference.duration, span
-    beside = TABLES.beside_jump * whole
+    beside = TIMING.beside_jump * whole
     joins = joins[(joins > begin + 2 * beside) & (joins < end - 2 * beside)]
     sides = np.concatenate([joins - beside, joins + beside])
     changes = reference.t[
-        (reference.t > begin + TABLES.same_node * whole) & (reference.t < end - TABLES.same_node * whole)
+        (reference.t > begin + TIMING.same_node * whole) & (reference.t < end - TIMING.same_node * whole)
     ]
     if sides.size:
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * beside]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TABLES.same_node * whole)
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TIMING.same_node * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
     mesh = subdivide(nodes, parts)
     fractions = (mesh - begin) / (end - begin)

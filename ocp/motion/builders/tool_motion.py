@@ -141,36 +141,26 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
 class ToolMotionSetup:
     """Boundary conditions, cost, limits and formulation of `tool_motion_problem`.
 
-    Attributes:
-        base: Configuration of the base at the start. Shape (base_size,).
-        start: Start configuration, rad or m. Where it is nan, or None, the start is free, and the tips must be where
-            their tasks begin. Shape (joint_size,).
-        reference: Configuration that satisfies the tasks at the start. A cyclic task is checked there, and with a free
-            start a velocity task starts with the tip there. Shape (joint_size,).
-        cyclic: Whether the joints end where they start.
-        weights: Weights of the squared joint rates. Shape (joint_size,).
-        bounds: Limits of joint positions and rates.
-        time_cost: Cost per second if the tasks may be executed more slowly. The horizon of the problem is then the
-            tasks' own, with the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints,
-            and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
-            None for rates as the control. The states "velocities" replace the rates, the tasks are constrained by their
-            accelerations, and velocities are continuous between stretches.
-        relaxed: Whether tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
-            constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the
-            tasks within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the
-            tasks' own time and without actuator limits.
-        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+    With a `time_cost` the tasks may be executed more slowly. The horizon of the problem is then the tasks' own, with
+    the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints, and PACE, that of the
+    time, at least 1. With `actuation` the states "velocities" replace the rates, and the tasks are constrained by their
+    accelerations.
+
+    `relaxed` tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
+    constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the tasks
+    within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the tasks' own time and
+    without actuator limits.
     """
 
-    base: Array
-    start: Array | None
+    base: Array  # configuration of the base at the start, (base_size,)
+    start: Array | None  # configuration, nan or None where free if the tips are where their tasks begin, (joint_size,)
+    # configuration that satisfies the tasks at the start; there a free velocity task begins, (joint_size,)
     reference: Array
-    cyclic: bool
-    weights: Array
-    bounds: JointBounds
-    time_cost: float | None = None
-    actuation: Actuation | None = None
+    cyclic: bool  # whether the joints end where they start
+    weights: Array  # of the squared joint rates, (joint_size,)
+    bounds: JointBounds  # limits of joint positions and rates
+    time_cost: float | None = None  # per second; None keeps the tasks' own time
+    actuation: Actuation | None = None  # options of accelerations (jerks) as the control; None for rates as the control
     relaxed: bool = False
     clearance_constraints: ClearanceConstraints | None = None
 

@@ -34,16 +34,28 @@ from ocp.problem.values import Sampler
 Mask: TypeAlias = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class NearbySettings:
-    """Settings of the search for IK solutions that a solver may have missed at a pose, by solving for poses nearby."""
+TINY = 1e-300
+"""Small number that is added to divisors to avoid divisions by zero."""
+SIX, SCARA = 6, 4
+"""Numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA."""
 
+
+@dataclass(frozen=True)
+class FormSettings:
+    """Settings of closed-form inverse kinematics; lengths are relative to the size of the arm."""
+
+    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
+    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
+    near: float = 1e-3
+    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
+    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
+    # solutions that a solver may have missed at a pose are searched by solving for poses nearby
     pairs: int = 2  # number of pairs of nearby poses for each pose
-    distance: float = 1e-3  # typical distance of nearby poses, rad and share of the size of the arm
+    distance: float = 1e-3  # typical distance of nearby poses, also in rad
     seed: int = 0  # seed of the directions of nearby poses
 
 
-NEARBY = NearbySettings()
+FORMS = FormSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,31 +99,11 @@ class PoseSolver(ABC):
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
         """Yield poses near the given poses, in pairs on opposite sides, at which missing solutions may be found."""
-        rng = np.random.default_rng(NEARBY.seed)
-        for _ in range(NEARBY.pairs):
-            turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
+        rng = np.random.default_rng(FORMS.seed)
+        for _ in range(FORMS.pairs):
+            turn, shift = FORMS.distance * rng.normal(size=(2, 3))
             for sign in (1.0, -1.0):
                 yield Motion(tips.turn @ rotation_matrices(sign * turn), tips.shift + sign * self.chain.size * shift)
-
-
-TINY = 1e-300
-"""Small number that is added to divisors to avoid divisions by zero."""
-SIX, SCARA = 6, 4
-"""Numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA."""
-
-
-@dataclass(frozen=True)
-class FormSettings:
-    """Tolerances of closed-form inverse kinematics; lengths are relative to the size of the arm."""
-
-    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
-    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
-    near: float = 1e-3
-    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
-    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
-
-
-FORMS = FormSettings()
 
 
 @dataclass(frozen=True, eq=False)

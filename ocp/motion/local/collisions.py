@@ -199,13 +199,8 @@ def slide_apart(
 ) -> Array:
     """Move configurations (K, n) out of collision along their self-motion manifolds, as far as necessary or possible.
 
-    Args:
-        jacobian: Jacobian (m, n) of the task at a configuration (n,).
-        back: Function from configurations (K, n) to nearby ones that satisfy the task again.
-        lower, upper: Limits of the joints. Shape (n,).
-
-    Returns:
-        For each configuration the one on its path with the largest minimum distance. Shape (K, n).
+    Return for each the one on its path with the largest minimum distance. `jacobian` gives the Jacobian (m, n) of the
+    task at a configuration (n,), and `back` moves configurations to nearby ones that satisfy the task again.
     """
     count, n = joints.shape
     target = scene.clearance + SLIDING.spare

@@ -317,13 +317,8 @@ def gauss_newton(
 ) -> tuple[Array, Array]:
     """Run damped Gauss-Newton iterations from K starts; return joint positions (K, n) and largest residuals (K,).
 
-    Args:
-        function: CasADi Function of the joint positions and `fixed` that returns a residual and its Jacobian.
-        starts: Initial configurations. Shape (K, n).
-        lower, upper: Limits of the joints. Shape (n,).
-        tolerance: Largest residual of a solution.
-        iterations: Largest number of iterations.
-        fixed: Further arguments of the function, common to all starts.
+    `function` of the joint positions and `fixed` returns a residual and its Jacobian; `tolerance` is the largest
+    residual of a solution.
     """
     q = starts.copy()
     count, n = q.shape

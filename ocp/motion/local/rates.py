@@ -157,13 +157,10 @@ def resolve(
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
     solution = _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
     if scene is None:
-        return replace(solution, clearance=np.full(len(solution.t), np.nan))
+        return solution
     distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
-    if not distances.shape[1]:
-        return replace(solution, clearance=np.full(len(solution.t), np.inf))
-    labels = scene.labels
-    nearest = tuple(labels[k] for k in distances.argmin(axis=1).tolist())
-    return replace(solution, clearance=distances.min(axis=1), nearest=nearest)
+    nearest = tuple(scene.labels[k] for k in distances.argmin(axis=1).tolist()) if distances.size else ()
+    return replace(solution, clearance=distances.min(axis=1, initial=np.inf), nearest=nearest)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
@@ -283,6 +280,7 @@ def _report(
         tolerance=tolerance,
         stopped=stopped,
         task_error=error.reshape(size, len(times)).T,
+        clearance=np.full(len(times), np.nan),
     )
 
 
@@ -366,7 +364,7 @@ def track_tasks(
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
     motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
     pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
-    functions = [equations.function, *([_cone_function(equations)] if min_cosines.size else [])]
+    functions = [equations.function, *([equations.cone_function] if min_cosines.size else [])]
     symbols = [
         symbols_of(*functions).sym("input", size) for size in (machine.base_size, machine.joint_size, len(targets))
     ]
@@ -427,18 +425,6 @@ def track_tasks(
         errors_along.max(axis=1),
         times[worst],
     )
-
-
-def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) of the cosines of tool-axis tilts, and their gradients."""
-    machine = equations.machine
-    b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
-    targets = ca.SX.sym("targets", equations.target_function().numel_out())
-    cosines = equations.cone_cosines(b, q, targets)
-    slopes = ca.jacobian(cosines, q)
-    if machine.base_size:
-        slopes = slopes + ca.mtimes(ca.jacobian(cosines, b), ca.jacobian(machine.base_rate(b, q, u), u))
-    return ca.Function("leaning", [b, q, targets], [cosines, ca.densify(slopes)], {"cse": True})
 
 
 def _damped_rates(

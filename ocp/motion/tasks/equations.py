@@ -80,11 +80,8 @@ class TaskEquations:
         """Return the targets of all tasks (poses and velocities) as a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
-        rotation and angular velocity (9, 3), direction and angular velocity (3, 3). Of a path parameter in place of the
-        time, `pace` is the rate, 1/s.
-
-        Raises:
-            ProblemError: A track has a wrong size, is not finite, or depends on anything but the time.
+        rotation and angular velocity (9, 3), direction and angular velocity (3, 3). If `time` is a path parameter,
+        `pace` is its rate, 1/s. Raises ProblemError if a track is invalid, see `track_expression`.
         """
         parts = []
         for task in (part.task for part in self.bound):
@@ -331,13 +328,19 @@ class TaskEquations:
         bases, positions, targets = self._along(t, base, joints)
         if not self.cone_angles.size:
             return np.zeros((len(positions), 0))
-        cosines = np.array(self._cone_function.map(len(positions))(bases.T, positions.T, targets)).T
+        cosines = np.array(self.cone_function.map(len(positions))(bases.T, positions.T, targets)[0]).T
         return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.cone_angles, 0.0))
 
     @cached_property
-    def _cone_function(self) -> Any:
-        symbols = self._symbols
-        return ca.Function("cone_cosines", symbols, [self.cone_cosines(*symbols)], {"cse": True})
+    def cone_function(self) -> Any:
+        """CasADi Function (base, joints, targets) -> (`cone_cosines`, their gradients in the joint rates)."""
+        base, joints, targets = self._symbols
+        cosines, rates = self.cone_cosines(base, joints, targets), ca.SX.sym("rates", self.machine.joint_size)
+        slopes = ca.jacobian(cosines, joints)
+        if self.machine.base_size:
+            motion = ca.jacobian(self.machine.base_rate(base, joints, rates), rates)
+            slopes += ca.mtimes(ca.jacobian(cosines, base), motion)
+        return ca.Function("cones", [base, joints, targets], [cosines, ca.densify(slopes)], {"cse": True})
 
     @cached_property
     def function(self) -> Any:

@@ -135,9 +135,7 @@ def checked_speed(speed: Any) -> float:
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
     """Return the functions of time of a tool that moves along a path; in builders they need symbols=casadi.MX.
 
-    Args:
-        path: Path from `models.smooth`, with the orientation of the tool.
-        speed: Constant, m/s; or the speed over time as a SpeedProfile or a Schedule of the path.
+    The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
     Raises:
         ProblemError: `path` is not a path, the speed is not positive, or the profile is of another path.
@@ -219,16 +217,12 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a target, given as a constant or a function of time, as a dense expression of the symbol `time`.
-
-    Args:
-        track: A constant, or a function of CasADi time since its `begin`, s.
-        time: The symbol.
-        shapes: Expected shape, or several that are accepted.
-        what: Name of the track in errors.
+    """Return a target, a constant or a function of CasADi time since its begin, as a dense expression of the symbol
+    `time`.
 
     Raises:
-        ProblemError: Another shape, a value that is not finite, or an expression of anything but the time.
+        ProblemError: Another shape than those allowed, a value that is not finite, or an expression of anything but the
+            time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
     value = _call_track(track, time - begin if begin else time, what) if callable(track) else track

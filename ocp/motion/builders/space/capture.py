@@ -208,14 +208,9 @@ def solve_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Solve `capture_problem` within its limits everywhere, and audit the plan.
+    """Solve `capture_problem` within its limits everywhere, and audit the plan; raise SolveError if there is none.
 
-    `method` is the first mesh of both phases, with controls at the points. The phases of the solution are "approach"
-    and "detumble".
-
-    Raises:
-        ProblemError: As `capture_problem`.
-        SolveError: No motion satisfies its limits.
+    `method` is the first mesh of both phases, with controls at the points.
     """
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:

@@ -65,9 +65,9 @@ def guess_in_time(
     """Solve a footstep motion in the requested durations on a coarse mesh, as an initial guess; return None on failure.
 
     Raises:
-        SolveError: The quickest steps take longer than requested, and no steps in the requested durations were found:
-            `name` is the phase with the largest extension, `value` and `limit` its quickest and requested durations, s.
-            Or no steps were found in any durations; then `conflicts` has the constraints that would have to be relaxed.
+        SolveError: The quickest steps take longer than requested: `name` is the phase with the largest extension,
+            `value` and `limit` its quickest and requested durations, s. Or no steps were found in any durations; then
+            `conflicts` has the constraints that would have to be relaxed.
     """
     seconds = {
         name: phase.seconds
@@ -267,8 +267,7 @@ def solve_steps(
 ) -> Solution:
     """Plan the footsteps of `steps_problem` and audit the plan; refine the mesh until a plan is feasible.
 
-    The audit may leave the optimality of the plan undetermined. After `time_limit` seconds the planner stops, between
-    two iterations of a solver.
+    The audit may leave the optimality of the plan undetermined. The planner stops after `time_limit` seconds.
 
     Raises:
         SolveError: The quickest steps take longer than requested; names the phase and its duration. Or no steps exist
