@@ -346,55 +346,47 @@ def resolve_accelerations(
     one_step = ca.Function("step", [state, time], [rk4_step(rate, state, width)])
     advance = cache(lambda count: one_step.mapaccum("steps", count))
     outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
-    recorder = _Recorder(outputs, function, own.stop_at_lift_off, own.speed_limit)
-    values, done = np.concatenate([joints, velocities]), 0
-    stopped = recorder.add(np.zeros(1), values[None, :])
+    states, done = np.concatenate([joints, velocities])[None, :], 0
+    first, stopped = _samples(outputs, function, np.zeros(1), states, own)
+    records = [first]
     while done < steps and stopped is None:
         count = min(STEPS_PER_CALL, steps - done)
-        states = np.array(advance(count)(values, (done * width + width * np.arange(count))[None, :])).T
-        stopped = recorder.add(np.asarray((done + np.arange(1, count + 1)) * width), states)
-        values, done = states[-1], done + count
-    return AccelerationSolution(law, *recorder.results(), stopped)
+        states = np.array(advance(count)(states[-1], (done * width + width * np.arange(count))[None, :])).T
+        record, stopped = _samples(outputs, function, (done + np.arange(1, count + 1)) * width, states, own)
+        records.append(record)
+        done += count
+    whole = {name: np.concatenate([record[name] for record in records]) for name in first}
+    gap = whole.pop("gap")
+    return AccelerationSolution(law, StandingMotion(**whole), gap, stopped)
 
 
-class _Recorder:
-    """Recorder of the samples of a simulated motion until a sample fails: lift-off, too fast, or not finite."""
-
-    def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
-        self._motion, self._law = motion, law
-        self._stop_at_lift_off, self._speed_limit = stop_at_lift_off, speed_limit
-        self._records: list[dict[str, Array]] = []
-
-    def add(self, times: Array, states: Array) -> Stop | None:
-        """Record samples of the motion up to the first one that fails; return why it fails, None if none fails."""
-        n = states.shape[1] // 2
-        q, qd = states[:, :n], states[:, n:]
-        qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        outputs = evaluate_motion(self._motion, times, q, qd, qdd=qdd)
-        not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
-        vertical = outputs["ground_force"][:, 2]
-        speed = np.abs(qd).max(axis=1)
-        too_fast = speed > self._speed_limit
-        lifted = (vertical <= 0) & self._stop_at_lift_off
-        bad = not_finite | too_fast | lifted
-        end = int(bad.argmax()) if bad.any() else len(times)
-        count = end + 1 if bad.any() and not not_finite[end] else end  # a finite failing sample is recorded too
-        motion = {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
-        self._records.append({name: value[:count] for name, value in {**motion, **outputs}.items()})
-        if end == len(times):
-            return None
-        at = float(times[end])
-        if not_finite[end]:
-            words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
-            return Stop("breakdown", at, words)
-        if lifted[end]:
-            words = f"lifts off at {at:.4g} s: the vertical ground force falls to {vertical[end]:.4g} N"
-            return Stop("lift_off", at, words)
-        words = f"diverges at {at:.4g} s: a joint reaches {speed[end]:.4g} rad/s (or m/s), above {self._speed_limit:g}"
-        return Stop("divergence", at, words)
-
-    def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion, and the norm of the pose errors of its tips at each sample. Shape (M,)."""
-        joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
-        gap = joined.pop("gap")
-        return StandingMotion(**joined), gap
+def _samples(
+    motion: Any, law: Any, times: Array, states: Array, options: AccelerationOptions
+) -> tuple[dict[str, Array], Stop | None]:
+    """Return samples of a motion by name up to the first one that fails, and why it fails: lift-off, too fast, or not
+    finite. A finite sample that fails is among them; "gap" is the norm of the pose errors of the tips.
+    """
+    q, qd = np.split(states, 2, axis=1)
+    qdd, gap = (np.array(part).T for part in law.map(len(times))(times[None, :], q.T, qd.T))
+    outputs = evaluate_motion(motion, times, q, qd, qdd=qdd)
+    not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
+    vertical, speed = outputs["ground_force"][:, 2], np.abs(qd).max(axis=1)
+    lifted = (vertical <= 0) & options.stop_at_lift_off
+    bad = not_finite | (speed > options.speed_limit) | lifted
+    end = int(bad.argmax()) if bad.any() else len(times)
+    outputs |= {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
+    record = {
+        name: value[: end if end == len(times) or not_finite[end] else end + 1] for name, value in outputs.items()
+    }
+    if end == len(times):
+        return record, None
+    at = float(times[end])
+    if not_finite[end]:
+        words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
+        return record, Stop("breakdown", at, words)
+    if lifted[end]:
+        words = f"lifts off at {at:.4g} s: the vertical ground force falls to {vertical[end]:.4g} N"
+        return record, Stop("lift_off", at, words)
+    limit = options.speed_limit
+    words = f"diverges at {at:.4g} s: a joint reaches {speed[end]:.4g} rad/s (or m/s), above {limit:g}"
+    return record, Stop("divergence", at, words)

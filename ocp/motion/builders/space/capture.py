@@ -22,7 +22,7 @@ import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
 from models.checks import Array
-from models.spatial import Expression
+from models.spatial import Expression, Frame
 from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
@@ -179,9 +179,8 @@ def capture_problem(
             largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
             reach of the arm, m.
     """
-    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
-    first, second = own.approach(), own.declare_second_phase(None)
-    own.guess_approach(first)
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
+    second, first = own.declare_second_phase(None), own.approach(clearance_constraints)
     guess_braking(second, own.pair, _end_of_guess(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
@@ -201,27 +200,17 @@ def solve_capture(
     chaser: FreeFloating,
     capture: Capture,
     *,
-    start: Any,
-    limits: Limits | None = None,
-    cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
-    method: Collocation | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    method: Collocation = POINTS,
+    **options: Any,
 ) -> Solution:
-    """Solve `capture_problem` within its limits everywhere, and audit the plan; raise SolveError if there is none.
-
-    `method` is the first mesh of both phases, with controls at the points.
-    """
+    """Solve `capture_problem` with its options within its limits everywhere, first on the mesh `method`."""
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:
-        return capture_problem(
-            chaser, capture, start=start, limits=limits, cost=cost, clearance_constraints=constraints
-        )
+        return capture_problem(chaser, capture, clearance_constraints=constraints, **options)
 
-    machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
-    mesh = POINTS if method is None else method
-    settings = SolveSettings(mesh, tolerances=tolerances)
-    return within_limits(declare, clearance_constraints, machines, settings=settings)
+    machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, options.get("limits")))
+    return within_limits(declare, clearance_constraints, machines, settings=SolveSettings(method))
 
 
 @interruptible
@@ -233,29 +222,31 @@ def chained_capture(
     limits: Limits | None = None,
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
-    method: Collocation | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    method: Collocation = POINTS,
 ) -> tuple[Solution, Solution]:
     """Plan the approach of a capture by itself, then the detumbling from its end, each at its own lowest cost.
 
-    The total cost exceeds that of `solve_capture`.
+    The total cost exceeds that of `capture_problem`, which has the same arguments.
 
-    Args, Raises: As for `solve_capture`.
+    Args:
+        method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 by default.
 
     Returns:
         Both solutions, each with its own audit.
+
+    Raises:
+        ProblemError: As `capture_problem`.
+        SolveError: No motion satisfies its limits.
     """
-    mesh = POINTS if method is None else require.instance("method", method, Collocation)
-    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    settings = SolveSettings(require.instance("method", method, Collocation))
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
     own.declare_second_phase(None)  # raises before the approach is solved
 
     def declare_approach(constraints: ClearanceConstraints | None) -> Problem:
-        problem = replace(own, clearance_constraints=constraints).approach()
+        problem = own.approach(constraints)
         own.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
-        own.guess_approach(problem)
         return problem
 
-    settings = SolveSettings(mesh, tolerances=tolerances)
     first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
     end["joints"] = own.arm_weights * end["joints"]
@@ -283,17 +274,9 @@ class _Capture:
     pair: FreeFloating
     start: State
     shared: Mapping[str, Any]
-    clearance_constraints: ClearanceConstraints | None
 
     @classmethod
-    def checked(
-        cls,
-        chaser: FreeFloating,
-        capture: Capture,
-        start: Any,
-        shared: Mapping[str, Any],
-        clearance_constraints: ClearanceConstraints | None,
-    ) -> _Capture:
+    def checked(cls, chaser: FreeFloating, capture: Capture, start: Any, shared: Mapping[str, Any]) -> _Capture:
         target = require.instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
         begin, joints, base = Start.of(start, chaser)
@@ -311,7 +294,7 @@ class _Capture:
         if capture.rest:
             bounds = (shared["limits"] or Limits()).bounds(chaser)
             require_capacity(chaser, momentum, wheel_capacity(chaser, bounds, state, capture.friction is None))
-        return cls(chaser, capture, pair, state, shared, clearance_constraints)
+        return cls(chaser, capture, pair, state, shared)
 
     @property
     def arm_weights(self) -> Array:
@@ -319,48 +302,42 @@ class _Capture:
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
-    def approach(self) -> Problem:
+    def approach(self, clearance_constraints: ClearanceConstraints | None) -> Problem:
         """Declare the problem of the approach, with the pose of the target as a state and the cone as a constraint."""
-        chaser, target, duration = self.chaser, self.capture.target, self.capture.approach
-        problem = dynamics_problem(
-            chaser,
-            (),
-            duration,
-            start=self.start.joints,
-            setup=DynamicsSetup(
-                start_velocity=self.start.velocities,
-                end_velocity="free",
-                start_base=self.start.base,
-                friction=self.capture.friction,
-                clearance_constraints=self.clearance_constraints,
-            ),
-            **self.shared,
+        chaser, target, duration, start = self.chaser, self.capture.target, self.capture.approach, self.start
+        setup = DynamicsSetup(
+            start_velocity=start.velocities,
+            end_velocity="free",
+            start_base=start.base,
+            friction=self.capture.friction,
+            clearance_constraints=clearance_constraints,
         )
-        earliest = duration.lower if isinstance(duration, FreeTime) else duration
-        require_reach(chaser, target, self.start, earliest)
+        problem = dynamics_problem(chaser, (), duration, start=start.joints, setup=setup, **self.shared)
+        require_reach(chaser, target, start, duration.lower if isinstance(duration, FreeTime) else duration)
         base, joints, _ = motion_of(problem)
-        none = ca.DM(0, 1)
-        begin = self.start.target_base
+        none, begin, cone = ca.DM(0, 1), start.target_base, self.capture.cone
         goal = problem.state("target", target.base_size, initial=begin, guess=begin, unit="m, rad")
         problem.dynamics(goal, target.base_rate(goal, none, none))
-        tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
-        place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone = self.capture.cone
         if cone is not None:
             self._require_inside(cone)
-            problem.path("cone", cone.inside(place), lower=0.0, unit="m")
+            problem.path("cone", cone.inside(self.tip_in_grasp(base, joints, goal).position), lower=0.0, unit="m")
+        out = np.zeros(3) if cone is None else cone.length * cone.direction
+        guess_approach(problem, chaser, target, start, out=out)
         return problem
+
+    def tip_in_grasp(self, base: Any, joints: Any, goal: Any) -> Frame:
+        """Return the pose of the chaser's tip in the grasped frame of a target with base configuration `goal`."""
+        tip, grasped = self.chaser.tip_pose(base, joints), self.capture.target.tip_pose(goal, ca.DM(0, 1))
+        back = grasped.rotation.T
+        return Frame(ca.mtimes(back, tip.rotation), ca.mtimes(back, tip.position - grasped.position))
 
     def _require_inside(self, cone: Cone) -> None:
         """Raise ProblemError if the tip starts near the grasp but outside the cone."""
-        start = self.start
-        tip = self.chaser.tip_pose(start.base, start.joints)
-        grasped = self.capture.target.tip_pose(start.target_base, ca.DM(0, 1))
-        place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position)))
-        inside = float(cone.inside(ca.DM(place)))
+        place = ca.DM(self.tip_in_grasp(self.start.base, self.start.joints, self.start.target_base).position)
+        distance, inside = float(ca.norm_2(place)), float(cone.inside(place))
         if inside < 0:
             words = (
-                f"capture: the tip starts {np.linalg.norm(place):.4g} m from the grasp and {-inside:.4g} m outside the "
+                f"capture: the tip starts {distance:.4g} m from the grasp and {-inside:.4g} m outside the "
                 f"cone, which is open to all directions at {2 * cone.length:.4g} m; start farther away or inside it"
             )
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
@@ -390,14 +367,10 @@ class _Capture:
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
         """Add the end condition that the chaser's tip has the pose and the twist of the grasped frame."""
-        chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
-        tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
-        turned = ca.mtimes(grasped.rotation.T, tip.rotation)
-        place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        rows = chaser.twist_rows
-        problem.end("grasp pose", ca.vertcat(ca.inv_skew(turned), place)[rows], 0.0, 0.0, unit="rad, m")
-        problem.end("grasp side", ca.trace(turned), lower=1.0)  # excludes half a turn
-        twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
+        tip, rows, none = self.tip_in_grasp(base, joints, goal), self.chaser.twist_rows, ca.DM(0, 1)
+        problem.end("grasp pose", ca.vertcat(ca.inv_skew(tip.rotation), tip.position)[rows], 0, 0, unit="rad, m")
+        problem.end("grasp side", ca.trace(tip.rotation), lower=1.0)  # excludes half a turn
+        twist = self.chaser.tip_twist(base, joints, rates) - self.capture.target.tip_twist(goal, none, none)
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
@@ -413,12 +386,6 @@ class _Capture:
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
         place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
         return ca.vertcat(place, attitude)
-
-    def guess_approach(self, problem: Problem) -> None:
-        """Set the initial guesses of the states and controls in the optimal control problem of an approach."""
-        cone = self.capture.cone
-        out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
 def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
