@@ -352,7 +352,8 @@ def resolve_accelerations(
     while done < steps and stopped is None:
         count = min(STEPS_PER_CALL, steps - done)
         states = np.array(advance(count)(states[-1], (done * width + width * np.arange(count))[None, :])).T
-        record, stopped = _samples(outputs, function, (done + np.arange(1, count + 1)) * width, states, own)
+        times = np.asarray((done + np.arange(1, count + 1)) * width)
+        record, stopped = _samples(outputs, function, times, states, own)
         records.append(record)
         done += count
     whole = {name: np.concatenate([record[name] for record in records]) for name in first}
@@ -375,9 +376,8 @@ def _samples(
     bad = not_finite | (speed > options.speed_limit) | lifted
     end = int(bad.argmax()) if bad.any() else len(times)
     outputs |= {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
-    record = {
-        name: value[: end if end == len(times) or not_finite[end] else end + 1] for name, value in outputs.items()
-    }
+    count = end + int(bad.any() and not not_finite[end])
+    record = {name: value[:count] for name, value in outputs.items()}
     if end == len(times):
         return record, None
     at = float(times[end])

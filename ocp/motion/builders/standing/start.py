@@ -102,32 +102,25 @@ def check_loads(
     reaction = machine.ground_reaction(joints, rest, qdd, wrenches)
     torques = machine.joint_torques(joints, rest, qdd, wrenches)
     effort = bounds.torque
-    rows = [
-        (torques[i] / effort[i], f"the torque of {name!r}, at most {effort[i]:g} N m (N)")
+    rows = [  # value, least and largest value, name of the limit
+        (torques[i] / effort[i], -1.0, 1.0, f"the torque of {name!r}, at most {effort[i]:g} N m (N)")
         for i, name in enumerate(machine.robot.joint_names)
         if np.isfinite(effort[i])
     ]
-    low, high = [-1.0] * len(rows), [1.0] * len(rows)
-    sides = [(reaction[5] / least_force, f"the vertical force, at least {least_force:g} N")]
-    low.append(1.0)
+    rows.append((reaction[5] / least_force, 1.0, np.inf, f"the vertical force, at least {least_force:g} N"))
+    scale = machine.weight * machine.support.half_widths.max()
     for normal, offset in _edges(machine, zmp):
         moment = normal[0] * -reaction[1] + normal[1] * reaction[0] - offset * reaction[5]
-        scale = machine.weight * machine.support.half_widths.max()
-        sides.append((moment / scale, "the place of the zero moment point"))
-        low.append(0.0)
-    high += [np.inf] * len(sides)
-    rows += sides
-    values = ca.vertcat(*(value for value, _ in rows))
-    function = ca.Function("start", [qdd], [ca.densify(values), ca.densify(ca.jacobian(values, qdd))])
+        rows.append((moment / scale, 0.0, np.inf, "the place of the zero moment point"))
+    values, low, high, names = zip(*rows, strict=True)
+    column = ca.vertcat(*values)
+    function = ca.Function("start", [qdd], [ca.densify(column), ca.densify(ca.jacobian(column, qdd))])
     at_rest, slopes = (np.array(part) for part in function(rest))
     violations = _least_violations(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
     if violations is None or violations.max(initial=0.0) <= STARTS.violation:
         return
-    words = [
-        f"{limit}, by {100 * share:.3g} %"
-        for (_, limit), share in zip(rows, violations, strict=True)
-        if share > STARTS.violation
-    ]
+    shares = zip(names, violations, strict=True)
+    words = [f"{limit}, by {100 * share:.3g} %" for limit, share in shares if share > STARTS.violation]
     message = (
         f"start {np.round(joints, 4).tolist()}: no joint accelerations satisfy the limits there: "
         f"{'; '.join(words)}; start elsewhere, load the tip less, or relax the limits"
