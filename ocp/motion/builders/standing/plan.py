@@ -11,19 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from models.machines.standing import Standing
 from ocp.audit.audit import Audit
-from ocp.console import interruptible, time_left, time_limited
+from ocp.console import interruptible, time_left
 from ocp.direct.discretisation import Collocation, MultipleShooting
-from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
+from ocp.errors import ProblemError, SolveError, SolverStatus, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
-from ocp.motion.builders.dynamics_plan import IPOPT, SolveSettings, audit_error
+from ocp.motion.builders.dynamics_plan import SolveSettings, audit_error
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -197,14 +197,14 @@ Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """Result of one solve with a certain formulation and mesh."""
+class Attempt(NamedTuple):
+    """Result of one solve: plan or last iterate, why it is no plan, and whether this is only that inequalities are
+    exceeded between the points of the grid.
+    """
 
-    name: str  # formulation, mesh, and whether bounds were tightened
-    solution: Solution | None  # plan, or last iterate
-    failure: SolveError | None = None  # reason why the solution is no plan
-    exceeded: bool = False  # whether its only failures are inequalities exceeded between the points of the grid
+    solution: Solution | None
+    failure: SolveError | None = None
+    exceeded: bool = False
 
 
 @interruptible
@@ -235,7 +235,7 @@ def solve_standing(
     solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     setup = StandingSetup() if setup is None else require.instance("solve_standing: setup", setup, StandingSetup)
     along_parameter = setup.along == "parameter"
-    judge = _Judge(solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
+    judge = partial(_audited, solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
     timed = not (isinstance(horizon, FreeTime) or along_parameter)
     breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
     trials = [
@@ -258,33 +258,31 @@ def solve_steps(
     steps: Steps,
     *,
     start: Any,
-    method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
-    tolerances: Mapping[str, float] | None = None,
-    time_limit: float | None = None,
     cost: StepWeights | None = None,
     limits: Limits | None = None,
+    settings: SolveSettings | None = None,
 ) -> Solution:
     """Plan the footsteps of `steps_problem` and audit the plan; refine the mesh until a plan is feasible.
 
-    The audit may leave the optimality of the plan undetermined. The planner stops after `time_limit` seconds.
+    The audit may leave the optimality of the plan undetermined.
 
     Raises:
         SolveError: The quickest steps take longer than requested; names the phase and its duration. Or no steps exist
             in any durations; names the conflicting constraints. Or no attempt passes; has the result of each.
         ProblemError: As `steps_problem`.
     """
-    if method is not None:
-        require.instance("method", method, Collocation)
+    solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     require.instance("solve_steps: steps", steps, Steps)
-    settings, step_options = {**IPOPT, **require.mapping("options", options)}, {"cost": cost, "limits": limits}
-    trials: list[Trial] = [(None, method or STEPS)]
-    judge = _Judge(tolerances, lambda _: None)
-    with time_limited(checked_time_limit(time_limit)):
-        guess = guess_in_time(steps, start, step_options, settings)
-        return _first_accepted(
-            lambda _: steps_problem(steps, start=start, cost=cost, limits=limits), trials, settings, judge, guess
-        )
+    guess = guess_in_time(steps, start, {"cost": cost, "limits": limits}, solving.ipopt_options)
+    judge = partial(_audited, solving.tolerances, lambda _: None)
+    trials: list[Trial] = [(None, solving.method or STEPS)]
+    return _first_accepted(
+        lambda _: steps_problem(steps, start=start, cost=cost, limits=limits),
+        trials,
+        solving.ipopt_options,
+        judge,
+        guess,
+    )
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
@@ -298,32 +296,30 @@ def _first_accepted(
     declare: Callable[[Level | None], Problem],
     trials: Sequence[Trial],
     settings: Mapping[str, Any],
-    judge: _Judge,
+    judge: Callable[..., Attempt],
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
     """Try formulations and meshes in turn, and return the first plan that the audit accepts; raise SolveError or
     ProblemError if there is none, or if collisions are all that is wrong with a plan.
     """
-    reasons: list[str] = []
-    failure = SolveError()
-    refused: list[ProblemError] = []
-    last: Solution | None = None
+    reasons, refused = list[str](), list[ProblemError]()
+    failure, last = SolveError(), None
     for level, mesh in trials:
+        label = "" if level is None else f"tip {level}, "
         try:
             problem = declare(level)
         except ProblemError as error:  # one formulation may leave freedom where the other leaves none
             refused.append(error)
-            reasons.append(f"{_label_of_level(level)}{error}")
+            reasons.append(f"{label}{error}")
             if len(refused) == len(trials):
                 raise refused[0] from None
             continue
         diagnosed = guess is None and level == trials[-1][0]
-        for attempt in _attempts(problem, level, mesh, settings, judge, guess, diagnosed=diagnosed):
+        for name, attempt in _attempts(problem, mesh, settings, judge, guess, diagnosed=diagnosed):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
-            last = attempt.solution or last
-            reasons.append(f"{attempt.name}: {attempt.failure}")
-            failure = attempt.failure or failure
+            last, failure = attempt.solution or last, attempt.failure or failure
+            reasons.append(f"{label}{name}: {attempt.failure}")
     raise SolveError(
         "no standing plan passes its audit:\n" + "\n".join(reasons), last, failure.conflicts,
         name=failure.name, value=failure.value, limit=failure.limit, time=failure.time,
@@ -343,60 +339,54 @@ def _formulations(control: str, free_time: bool, method: Collocation | None) -> 
 
 def _attempts(
     problem: Problem,
-    level: Level | None,
     mesh: Collocation | MultipleShooting,
     settings: Mapping[str, Any],
-    judge: _Judge,
+    judge: Callable[..., Attempt],
     guess: Solution | Mapping[str, Any] | None,
     *,
     diagnosed: bool,
-) -> Iterator[Attempt]:
-    """Yield attempts with one formulation on finer and finer meshes; the caller stops at an accepted one.
+) -> Iterator[tuple[str, Attempt]]:
+    """Yield attempts by name on finer and finer meshes; the caller stops at an accepted one.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
     for k in range(MESHES):
-        name = f"{_label_of_level(level)}{mesh.intervals} intervals"
-        first = diagnosed and k == 0
+        name, first = f"{mesh.intervals} intervals", diagnosed and k == 0
         attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
-        yield attempt
+        yield name, attempt
         guess = attempt.solution
         if attempt.solution is None or not attempt.solution.success or time_left() <= 0:
             return
         if attempt.exceeded:
             tightened = partial(tighten, problem, mesh, options=settings, guess=guess)
-            yield judge(f"{name}, tightened", problem, tightened)
+            yield f"{name}, tightened", judge(f"{name}, tightened", problem, tightened)
         mesh = mesh.halve()
 
 
-def _label_of_level(level: Level | None) -> str:
-    return "" if level is None else f"tip {level}, "
-
-
-@dataclass(frozen=True)
-class _Judge:
-    """Callable that runs a solver and audits the plan; `pose_error` rejects plans that pass but leave their tasks."""
-
-    tolerances: Mapping[str, float] | None
-    pose_error: Callable[[Audit], SolveError | None]
-
-    def __call__(self, name: str, problem: Problem, run: Callable[[], Solution]) -> Attempt:
-        try:
-            solution = run()
-        except SolveError as error:
-            return Attempt(name, error.solution, error)
-        if not solution.success:
-            if solution.status is SolverStatus.INTERRUPTED:
-                raise SolveError(f"interrupted during the solve with {name}", solution, name=name)
-            ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
-            return Attempt(name, solution, ended)
-        audit = solution.audit(tolerances=self.tolerances)
-        if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
-            if collision := collision_error(audit, solution):
-                raise collision
-            exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            return Attempt(name, solution, audit_error(audit, solution), exceeded)
-        return Attempt(name, solution, self.pose_error(audit))
+def _audited(
+    tolerances: Mapping[str, float] | None,
+    pose_error: Callable[[Audit], SolveError | None],
+    name: str,
+    problem: Problem,
+    run: Callable[[], Solution],
+) -> Attempt:
+    """Run a solver and audit the plan; `pose_error` rejects plans that pass but leave their tasks."""
+    try:
+        solution = run()
+    except SolveError as error:
+        return Attempt(error.solution, error)
+    if not solution.success:
+        if solution.status is SolverStatus.INTERRUPTED:
+            raise SolveError(f"interrupted during the solve with {name}", solution, name=name)
+        ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
+        return Attempt(solution, ended)
+    audit = solution.audit(tolerances=tolerances)
+    if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
+        if collision := collision_error(audit, solution):
+            raise collision
+        exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
+        return Attempt(solution, audit_error(audit, solution), exceeded)
+    return Attempt(solution, pose_error(audit))
 
 
 def _error_of_tips(

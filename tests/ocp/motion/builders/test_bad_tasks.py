@@ -625,10 +625,11 @@ STEPS = [
     Case("steps_problem", steps_problem, STEPPED, STEP_OPTIONS),
     Case(
         "solve_steps",
-        solve_steps,
+        lambda **options: solve_steps(**with_setup_of(SolveSettings, "settings", options)),
         STEPPED,
         {
             **STEP_OPTIONS,
+            "settings": but(INSTANCE, "None"),
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
             "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
