@@ -30,12 +30,9 @@ from ocp.solution import Solution
 
 CLEARANCE, APART = "clearance", "apart"
 """Name prefixes of the clearances that the audit proves (CLEARANCE) and of separation constraints (APART)."""
-ROUNDING = 3e-3
-"""Width of the smoothing of distances in separation constraints, m; see `rounding` of `models.shapes.distance`."""
-MAX_SOLVES = 6
-"""Largest number of solves of one motion; after each solve, the bodies that collide get separation constraints."""
-MARGIN = 5e-5
-"""First margin by which separated bodies must exceed the clearance, and least increase of such a margin, m."""
+ROUNDING = 3e-3  # width of the smoothing of distances in separation constraints, m; see `models.shapes.distance`
+MAX_SOLVES = 6  # largest number of solves of a motion, after each of which bodies that collide are separated
+MARGIN = 5e-5  # first margin of separated bodies beyond the clearance, and least increase of it, m
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,8 +49,7 @@ sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 % at 0.5 rad/s, and by LENGTH_
 """
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
-Motors = FixedBase | FreeFloating
-"""Type of the machines whose motion the joint torques alone determine."""
+Motors = FixedBase | FreeFloating  # type of the machines whose motion the joint torques alone determine
 
 
 @dataclass(frozen=True)

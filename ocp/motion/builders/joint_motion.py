@@ -33,8 +33,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-RATE_SLACK = 1e-9
-"""Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
+RATE_SLACK = 1e-9  # relative excess over a rate limit, at which a motion at constant speed may be all the time
 
 
 @remembers_request("joint motion")
@@ -110,8 +109,7 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     return path_solution(problem, "path at constant speed", curves, horizon=horizon, cost=cost, message=message)
 
 
-GUESS_STEPS = 64
-"""Number of time steps of the resolved-rate motion that is the initial guess; breaks of tasks add further steps."""
+GUESS_STEPS = 64  # number of time steps of the motion that is the initial guess, besides breaks of tasks
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,8 +44,7 @@ from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, integrate_j
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-Columns = Callable[[Array], Array]
-"""Type of a function that returns C quantities of a path, shape (M, C), at times (M,) of the reference motion."""
+Columns = Callable[[Array], Array]  # function that returns C path quantities (M, C) at times (M,) of the reference
 
 
 @dataclass(frozen=True)

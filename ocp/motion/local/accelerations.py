@@ -225,10 +225,8 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
     return ca.mtimes(directions, rows), ca.mtimes(directions, target)
 
 
-TIP_TOLERANCE = 1e-3
-"""Largest pose error up to which a motion counts as successful, m and rad."""
-STEPS_PER_CALL = 50
-"""Number of integration steps between two checks whether the motion fails."""
+TIP_TOLERANCE = 1e-3  # largest pose error up to which a motion counts as successful, m and rad
+STEPS_PER_CALL = 50  # number of integration steps between two checks whether the motion fails
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from models.checks import Array
 from models.spatial import Frame, cross, expression, rotation
 from ocp.problem.values import Sampler
 
-TURN = 2 * np.pi
-"""Angle of a full turn, rad."""
+TURN = 2 * np.pi  # angle of a full turn, rad
 
 
 @dataclass(frozen=True)

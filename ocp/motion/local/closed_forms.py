@@ -34,10 +34,8 @@ from ocp.problem.values import Sampler
 Mask: TypeAlias = NDArray[np.bool_]
 
 
-TINY = 1e-300
-"""Small number that is added to divisors to avoid divisions by zero."""
-SIX, SCARA = 6, 4
-"""Numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA."""
+TINY = 1e-300  # small number that is added to divisors to avoid divisions by zero
+SIX, SCARA = 6, 4  # numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA
 
 
 @dataclass(frozen=True)

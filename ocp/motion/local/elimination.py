@@ -36,10 +36,10 @@ SAMPLES = 2 * np.pi / 3 * np.arange(3)
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
 
 
+# coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2
 PRODUCTS = np.array(
     [[[1, 0, 0, 0], [0, 1, 0, 0]], [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]], [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]]
 )
-"""Coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2."""
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ from ocp.motion.local.elimination import elimination_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
 
-ROTATION_TOLERANCE = 1e-6
-"""Largest accepted entry of R R^T - 1 for a rotation matrix R."""
+ROTATION_TOLERANCE = 1e-6  # largest accepted entry of R R^T - 1 for a rotation matrix R
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 """Increments of the sampled parameters, as fractions of their ranges; irrational, so that no sample repeats."""
 

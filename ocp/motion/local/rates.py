@@ -32,8 +32,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.values import Sampler, symbols_of
 
-MAX_INTEGRATOR_STEPS = 20000
-"""Largest number of integrator steps between two samples; a smooth motion takes some tens."""
+MAX_INTEGRATOR_STEPS = 20000  # largest number of integrator steps between two samples; a smooth motion takes some tens
 
 
 @dataclass(frozen=True)
@@ -289,8 +288,7 @@ def _manipulabilities(jacobians: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobians, compute_uv=False).prod(axis=-1))
 
 
-CORRECTIONS = 2
-"""Number of Newton corrections of the pose after each step; each correction about squares the remaining error."""
+CORRECTIONS = 2  # number of Newton corrections of the pose after each step, each of which squares the error
 
 
 @dataclass(frozen=True, eq=False)

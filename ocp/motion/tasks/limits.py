@@ -16,9 +16,7 @@ from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import expression
 from ocp.errors import ProblemError, require
 
-PARALLEL = 1e-12
-"""Cosine between a direction and the normal of a support edge below which the edge counts as parallel to the direction.
-"""
+PARALLEL = 1e-12  # cosine to the normal of a support edge below which a direction counts as parallel to the edge
 
 ROUNDING_M = 1e-9
 REFERENCE_SAMPLES = 201  # number of times at which a reference is checked

@@ -20,8 +20,7 @@ from models.checks import Array, short_repr
 from ocp.errors import ProblemError, require, values_within
 from ocp.tolerances import ROUNDING_SHARE
 
-Phases = tuple[tuple[float, float], ...]
-"""Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
+Phases = tuple[tuple[float, float], ...]  # durations (s) and jerks (m/s^3) of consecutive phases of constant jerk
 
 
 class LineMotion(NamedTuple):

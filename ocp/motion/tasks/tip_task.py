@@ -23,8 +23,7 @@ from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
-Velocity: TypeAlias = Any
-"""Prescribed velocity: a constant or a function of time, with one entry for each row of the task."""
+Velocity: TypeAlias = Any  # constant or function of time with one entry for each row of the task
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
 Roll: TypeAlias = Literal["free", "given"]
 

@@ -22,19 +22,15 @@ from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import SpeedProfile
 
-Track: TypeAlias = Any
-"""Target over time: a constant, or a function of CasADi time (s) that returns a vector, matrix or list of expressions.
-"""
+Track: TypeAlias = Any  # constant, or function of CasADi time (s) that returns a vector, matrix or list of expressions
 
 _Result = TypeVar("_Result")
 
-MAX_ROTATION_RAD = np.pi - 1e-3
-"""Largest rotation between the two poses of a `pose_line`, because the sense of half a turn is ambiguous."""
+MAX_ROTATION_RAD = np.pi - 1e-3  # largest rotation of a `pose_line`, since the sense of half a turn is ambiguous
 PATH_ACCELERATION = 1.0
 """Default acceleration along a path, m/s^2. Controllers of robot arms have defaults of about this size for motions on
 straight lines (Universal Robots: 1.2 m/s^2)."""
-RISE_TIME_S = 0.1
-"""Time in which the default jerk builds up the acceleration along a path, s."""
+RISE_TIME_S = 0.1  # time in which the default jerk builds up the acceleration along a path, s
 
 
 class PoseLine(NamedTuple):

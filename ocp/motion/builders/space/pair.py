@@ -95,8 +95,7 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
     return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
 
 
-Guesses = dict[str, Any]
-"""Type of an initial guess: a dictionary from the names of states and controls to functions of time."""
+Guesses = dict[str, Any]  # functions of time by the names of states and controls
 
 
 @dataclass(frozen=True)
@@ -309,8 +308,7 @@ def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
                 pool[name] = replace(pool[name], guess=guess)
 
 
-ROUNDING = 1e-9
-"""Rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s."""
+ROUNDING = 1e-9  # rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s
 
 
 class State(NamedTuple):

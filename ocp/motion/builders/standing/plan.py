@@ -186,12 +186,9 @@ POINTS = Collocation(20, degree=5, scheme="legendre")
 """Mesh with controls at the collocation points, for smooth plans, which pass the audit with few intervals."""
 LINEAR = MultipleShooting(50, control="linear")
 """Mesh with controls linear between the nodes, for plans that switch between limits, such as those of least time."""
-STEPS = Collocation(12, degree=3, scheme="legendre")
-"""First mesh of each phase in `solve_steps`."""
-MESHES = 3
-"""Largest number of meshes for each formulation; a mesh is twice as fine as the mesh before."""
-POSE_TOLERANCE = 1e-5
-"""Largest accepted pose error of the re-integrated plan, m and rad; a start gap that a task allows may be larger."""
+STEPS = Collocation(12, degree=3, scheme="legendre")  # first mesh of each phase in `solve_steps`
+MESHES = 3  # largest number of meshes for each formulation; a mesh is twice as fine as the mesh before
+POSE_TOLERANCE = 1e-5  # largest pose error of the re-integrated plan, m and rad, unless a task has a larger gap
 
 Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]

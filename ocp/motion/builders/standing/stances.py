@@ -211,8 +211,7 @@ def walk(
     return tuple(phases)
 
 
-PLACEMENT_TOLERANCE = 1e-6
-"""Largest accepted gap between a foot and its foothold at the start, m or rad."""
+PLACEMENT_TOLERANCE = 1e-6  # largest accepted gap between a foot and its foothold at the start, m or rad
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
