@@ -152,21 +152,17 @@ def roll_problem(
 ) -> Problem:
     """Declare the optimal control problem of the rig's redundant angle (roll) along a trajectory of tool targets.
 
-    The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v.
-    The states are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints
-    "reach" (sin q4 and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from
-    obstacles.
+    The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v. The states
+    are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints "reach" (sin q4
+    and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from obstacles. The
+    guess is the roll of least cost on a grid of rolls and times.
 
     Args:
-        rig, tunnel: Captive trajectory rig and wind tunnel.
         targets: Function of `problem.time` (s) that returns the target, shape (5, 1): expressions, or spline_targets.
         horizon: Final time, s.
         start_roll, start_rate: Roll (rad) and rate (rad/s) at time 0; free if None.
-        settings: Weights and limits; the defaults if None.
+        settings: Weights and limits.
         obstacles: Obstacles; None for none.
-
-    Returns:
-        The problem. Its guess is the roll of least cost on a grid of rolls and times, see least_cost_roll.
 
     Raises:
         ProblemError: The horizon is not positive; no roll reaches one of the targets; the start is outside the limits.

@@ -274,20 +274,19 @@ def dynamics_problem(
     """Declare the optimal control problem of a motion within actuator limits that minimises effort, energy or time.
 
     The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
-    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted.
-    The path constraints are "torques", "power", and with tasks "tip": the time derivative of the
-    task velocities, with pose errors fed back. A start with free velocity must satisfy the task velocities.
+    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted. The
+    path constraints are "torques", "power", and with tasks "tip": the time derivative of the task velocities, with pose
+    errors fed back. A start with free velocity must satisfy the task velocities.
 
     Args:
         machine: A FixedBase, or a FreeFloating machine, whose momentum is conserved.
-        tasks: A TipTask, or several that are done at once over the whole motion, functions of the time in s. An empty
-            sequence for a motion from point to point.
+        tasks: A TipTask, several that are done at once over the whole motion, or none. Functions of the time in s.
         horizon: Final time, s, or FreeTime(...).
-        start, end: Start and end configurations. Shape (n,), rad or m; nan where free, None if all are free. A
-            start is free only in a phase that is joined to another.
+        start, end: Start and end configurations. Shape (n,), rad or m; nan where free, None if all are free. A start is
+            free only in a phase that is joined to another.
         limits: Limits of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         cost: Weights of the cost; the squared torques if None.
-        setup: Velocities and base at both ends, friction, loads, control and clearance; the defaults if None.
+        setup: Velocities and base at both ends, friction, loads, control and clearance.
 
     Raises:
         ProblemError: Sizes or options do not match; an end is outside the limits; the jerk is limited but not the

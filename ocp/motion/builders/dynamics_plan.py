@@ -56,14 +56,14 @@ def dynamics_phases(
         goals: At least one, each with joints and a duration; all have the joints of the machine.
         start: Start configuration. Shape (n,), rad or m.
         total: Duration of all phases together, s, if some have a free time; None leaves it free.
-        limits, cost, setup: Arguments of `dynamics_problem` for all phases. `start_velocity` and `start_base` apply
-            where the first one begins, `end_base` where the last one ends, and clearance in those phases whose machine
-            is that of the collision scene. The goals give their velocities themselves.
+        limits, cost, setup: Arguments of `dynamics_problem` for all phases. Velocity and base at the start and base at
+            the end are those of the whole motion, clearance applies where the machine is that of the collision scene,
+            and the goals give their velocities themselves.
 
     Raises:
         ProblemError: As `dynamics_problem`; there are no goals; one is a pose, or has no duration; their machines
             differ in the number of joints or in the kind of base; the machine changes while it moves or has momentum; a
-            phase with tasks starts at unknown joints; the phases cannot have this total duration; the setup has an
+            phase with tasks starts at unknown joints; the total duration is impossible; the setup has an
             `end_velocity`.
     """
     goals = checked_goals(goals)

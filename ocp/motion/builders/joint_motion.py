@@ -156,29 +156,24 @@ def minimum_velocity_problem(
     This is problem (27) of Kim and Kim 2011. The states are "joints", x2, and, on a floating base, "base"; the control
     is "rates". The path equality is "task", G x2' = v with the Jacobian G of the tasks, where v contains the drift of a
     machine with momentum and the feedback of a pose task. If tasks begin or end during the motion, the names end in the
-    number of the time interval between these events, see `ocp.motion.builders.tool_motion`.
+    number of the time interval between these events. The guess is a local motion.
 
     Args:
         machine, tasks: As for `plan`.
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration. Shape (joint_size,), rad or m. None leaves it free wherever the tips are at the
             beginning of their tasks. With a velocity task the tip is then where it is at `VelocitySetup.near`.
-        cyclic: Whether the joints end where they started, after a closed task. The closure that already follows from
-            the task is not required twice: the task may deviate by a constant velocity of the size of the
-            discretisation error, the state "closure", so that the joints close exactly. A floating base closes only if
-            the task requires it.
+        cyclic: Whether the joints end where they started, after a closed task, which may deviate by a constant velocity
+            of the size of the discretisation error, the state "closure". A floating base closes only if the task
+            requires it.
         weights: Weights of the squared joint rates, positive. Shape (joint_size,); all 1 if None.
         limits: Limits of joint positions and rates; the robot's own if None.
-        setup: Base at the start, guess and clearance; the defaults if None.
-
-    Returns:
-        The problem with its guess. Only the local motion is solved.
+        setup: Base at the start, guess and clearance.
 
     Raises:
         ProblemError: Rows are out of range, repeated, more than the joints, moved by no joint, or dependent everywhere;
             sizes are wrong; the start is outside the limits or off the task's pose; a cyclic task is not closed; the
-            horizon or the damping is not positive.
-        Unreachable: A free start was not found (a ProblemError).
+            horizon or the damping is not positive. Unreachable, a ProblemError, if a free start is not found.
     """
     setup = VelocitySetup() if setup is None else require.instance("setup", setup, VelocitySetup)
     require.flag("cyclic", cyclic)

@@ -186,10 +186,7 @@ def minimum_time_problem(
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
-    at rest" and "end at rest", "start jerk" and "end jerk".
-
-    Args:
-        path, limits, joints, guess, intervals: As for `solve_minimum_time`.
+    at rest" and "end at rest", "start jerk" and "end jerk". The arguments are those of `solve_minimum_time`.
 
     Raises:
         ProblemError: Joint limits are given without joints; limits of tool or torque are given; the joint jerk is

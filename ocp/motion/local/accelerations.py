@@ -297,14 +297,11 @@ def resolve_accelerations(
     """Simulate a standing machine under a resolved-acceleration law up to the horizon, or until the motion fails.
 
     Args:
-        machine: A Standing machine.
         tasks: A TipTask, or several that are done at once.
-        horizon: Final time, s.
+        horizon, step: Final time, and step of the integration and between samples, s.
         start: Start configuration, shape (n,), rad or m, or a `Start` with the joints and their velocities.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
         external: External wrenches as a function of time and tip position.
-        step: Step of the integration and between samples, s.
-        options: Options of the law and of the simulation; `AccelerationOptions()` if None.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.

@@ -477,8 +477,7 @@ def ik_configurations(
 
     Args:
         machine: Machine on a fixed base.
-        task: A position, with an orientation, a direction, a cone or neither.
-        time: Time of the task, s.
+        task: A position, with an orientation, a direction, a cone or neither, at a `time`, s.
         limits: Whether the position limits of the robot apply.
         samples: Number of samples of the free parameters, if the arm is redundant for the task.
 

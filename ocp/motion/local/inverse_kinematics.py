@@ -127,10 +127,8 @@ def inverse_kinematics(
     """Return distinct configurations in which the machine satisfies its pose tasks, sorted by decreasing quality.
 
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
-    `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
-    parameters are listed. Damped Gauss-Newton iterations from random starts, each of which leads to one solution at
-    most, solve other tasks and machines. They complete lists that may be incomplete, or that have too few members
-    because few samples keep the limits.
+    `ik_configurations`, of a redundant arm at samples of its free parameters. Damped Gauss-Newton iterations from
+    random starts solve other tasks and machines. They complete lists that may be incomplete or have too few members.
 
     Args:
         machine: Any machine; a floating base does not move.
@@ -144,9 +142,6 @@ def inverse_kinematics(
         scene: Collision scene of the machine; solutions closer than the clearance are left out. If that leaves none,
             the ones with the largest distances are moved along their self-motions.
         options: Base, limits and accuracy.
-
-    Returns:
-        The solutions, at least one, by decreasing quality.
 
     Raises:
         Unreachable: No start leads to the pose, with the nearest miss; or no solution is collision-free, with the pair

@@ -121,7 +121,8 @@ def resolve(
     """Compute a motion along tasks by resolved-rate control, with the least joint rates at each time.
 
     The joint rates are G# v, see `RateOptions`: equation (26) of Kim and Kim 2011 with u = 0. The drift of the machine
-    at rest and the feedback of pose tasks are part of v.
+    at rest and the feedback of pose tasks are part of v. The motion ends at the horizon, or at the last sample before
+    it breaks down, with the reason in `stopped`.
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
@@ -129,12 +130,8 @@ def resolve(
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
-        scene: Collision scene of the machine; the distances of its bodies are reported at the samples and have no
-            effect.
-        options: Weights, damping and tolerance; `RateOptions()` if None.
-
-    Returns:
-        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in `stopped`.
+        scene: Collision scene of the machine; the distances of its bodies are reported and have no effect.
+        options: Weights, damping and tolerance.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the task is singular at the start.

@@ -179,14 +179,13 @@ class Cost:
     with duration T, joint positions q, joint torques tau and angular velocity omega of the base.
 
     Attributes:
-        velocity: Weight of half the squared joint velocities.
+        velocity, jerk: Weights of half the squared joint velocities, and of the squared jerks.
         time: Weight of the duration, 1/s.
         effort: Weight of the squared torques (losses in the windings), one number or one for each joint, 1/(N m)^2/s.
         length: Weight of the length of the joint path, 1/rad.
         energy: Weight of the positive actuator work, 1/J. Braking regains nothing.
         acceleration: Weight of the squared accelerations, one number or one for each joint. It matters for light joints
             at the end of an arm, which need hardly any torque.
-        jerk: Weight of the squared jerks.
         turning: Weight of the squared angular velocity of a floating base, 1/(rad/s)^2/s.
         weights: Weights w of the joints in the velocity and the length, positive, shape (n,); all 1 if None.
 

@@ -156,14 +156,11 @@ class TipTask:
         Args:
             path: Path from `models.smooth`.
             speed: Speed between the two ramps, m/s, or a Schedule of the path, which specifies the whole motion.
-            acceleration: Largest acceleration along the path, m/s^2; None: 1 m/s^2.
-            jerk: Largest jerk along the path, m/s^3; None: the one that builds up the acceleration in 0.1 s.
-            steady: Whether the tip moves at the requested speed from the beginning of the path to its end, as in a pass
-                that is part of a longer motion. The motion then does not start at rest.
+            acceleration, jerk: Largest ones along the path, m/s^2 and m/s^3; None: 1 m/s^2, built up in 0.1 s.
+            steady: Whether the tip moves at this speed on the whole path, as in a pass that is part of a longer motion.
             roll: "free": the tool axis points as the path says and the roll about it is free (within a cone if `within`
                 is given); "given": the path prescribes the whole orientation.
-            others: Further attributes of the task: `tool_axis`, `link`, `gain`, `within`, `begin`, ...; `direction` or
-                `orientation` replace those of the path.
+            others: Further attributes of the task; `direction` or `orientation` replace those of the path.
 
         Raises:
             ProblemError: `path` is not a path, a number is not positive, an attribute is invalid, or acceleration and

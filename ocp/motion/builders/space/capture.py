@@ -166,18 +166,16 @@ def capture_problem(
     from the start of each phase.
 
     Args:
-        chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`). Its momentum is that at the
-            start, spinning wheels included.
-        capture: The capture.
+        chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`), with its momentum at the start.
         start: Joint positions of the chaser, shape (n,), rad or m, or a `Start` with base and velocities.
         limits, cost: Arguments of `dynamics_problem` for both phases.
         clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
 
     Raises:
-        ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. Or with
-            name "momentum": the wheels cannot hold the momentum of both at rest; `value` is its norm and `limit` the
-            largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
-            reach of the arm, m.
+        ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. With name
+            "momentum": the wheels cannot hold the momentum of both at rest; `value` is its norm and `limit` the largest
+            that they hold, N m s. With name "reach": `value` is the distance of the target and `limit` the reach of the
+            arm, m.
     """
     own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
     second, first = own.declare_second_phase(None), own.approach(clearance_constraints)

@@ -78,16 +78,14 @@ class Weights:
 class StandingSetup:
     """Settings of `standing_problem` that most motions leave at their defaults.
 
-    With tip_level "position" the tip is on its path at the nodes. It suits controls held over intervals or linear in
-    them, `MultipleShooting(..., control="held")` or `"linear"`, as in plans that switch. Held controls converge with
-    first order in the interval where a constraint of the ground is active: the audit finds the motion feasible, but its
-    cost above the tolerance for an optimum.
+    With tip_level "position" the tip is on its path at the nodes. It suits plans that switch, with controls held over
+    intervals or linear in them, `MultipleShooting(..., control="held")` or `"linear"`. Held controls converge with
+    first order where a constraint of the ground is active: the audit finds the motion feasible, but its cost too high.
 
-    With tip_level "acceleration" the tip's acceleration is that of the path, and its position follows as accurately as
-    the dynamics are integrated. It suits controls at the points of `Collocation(...)`, Legendre rather than Radau, is
-    much closer to the optimum for the same number of intervals, and is certified by the audit. Choose it where
-    prismatic joints move the tip along straight lines, between whose nodes the tip oscillates with "position". It does
-    not suit plans that switch: polynomials oscillate within an interval that contains a switch.
+    With tip_level "acceleration" the tip's acceleration is that of the path. It suits smooth plans with controls at the
+    points of `Collocation(...)`, Legendre rather than Radau: they are much closer to the optimum for the same number of
+    intervals. Choose it where prismatic joints move the tip along straight lines, between whose nodes the tip
+    oscillates with "position".
 
     Attributes:
         start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
@@ -96,10 +94,10 @@ class StandingSetup:
         control: "acceleration" or "jerk".
         along: Argument of the tasks: "time", or "parameter" from 0 to 1 with velocities per unit of it. A free final
             time needs "parameter", or tasks that suit any horizon.
-        tip_level: What the path constraint "tip" constrains. "position": the poses (m; sines of angles), and the
-            velocities of velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone
-            can close a gap at the start; what is left of the gap at the end still moves the joints.
-        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+        tip_level: What the constraint "tip" prescribes. "position": the poses (m; sines of angles), and velocities of
+            velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone can close a
+            gap at the start.
+        clearance_constraints: Collision avoidance; None for none.
         symbols: casadi.SX, or casadi.MX if a task, `external` or a reference calls an interpolant.
     """
 
@@ -158,28 +156,19 @@ def standing_problem(
 
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
-    0, and the control "path_acceleration". The path constraints are
-
-    - "tip", see `StandingSetup.tip_level`;
-    - "zero moment point", m; with InFoot the distance from the edges of the foot less the margin;
-    - "foot", the distance from edges that another rule leaves open, m;
-    - "vertical force", N;
-    - "friction", squared friction limit less squared tangential force, over the squared weight;
-    - "torques".
+    0, and the control "path_acceleration". The path constraints are "tip", see `StandingSetup.tip_level`; "zero moment
+    point", m, with InFoot the distance from the edges of the foot less the margin; "foot", the distance from edges that
+    another rule leaves open, m; "vertical force", N; "friction", squared friction limit less squared tangential force,
+    over the squared weight; and "torques". The guess is a local motion.
 
     Args:
-        machine: Standing machine.
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
         start: Start configuration. Shape (n,), rad or m.
         zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
-        weights: Weights of the parts of the cost.
-        limits: Limits of joints and ground.
-        setup: Both ends, external wrenches, control, formulation and clearance; the defaults if None.
-
-    Returns:
-        The problem, with a local motion as its guess.
+        weights, limits: Weights of the parts of the cost; limits of joints and ground.
+        setup: Both ends, external wrenches, control, formulation and clearance.
 
     Raises:
         ProblemError: Sizes, rows or options do not fit; the start is outside the limits; a task does not begin at its
