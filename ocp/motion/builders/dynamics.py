@@ -26,7 +26,13 @@ from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints, limit_torques
+from ocp.motion.builders.standing.problem import (
+    FreeTime,
+    constrain_tips,
+    declare_horizon,
+    declare_joints,
+    limit_torques,
+)
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
@@ -36,7 +42,7 @@ from ocp.motion.tasks.checks import (
     clip_to_limits,
     rates_at_rest,
 )
-from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -331,7 +337,11 @@ def dynamics_problem(
     if cost.energy or np.isfinite(bounds.power).any():
         running += limit_power(problem, torques * motion[2], bounds, cost)
     if equations is not None:
-        _declare_tasks(problem, equations, ends, motion, duration)
+        if not np.isnan(ends.first).any():
+            checked_tasks(equations, ends.base, ends.first, duration)
+        check_length(equations, ends.base, duration)
+        check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
+        constrain_tips(problem, equations, motion, (problem.time,), moving=not ends.rests[0])
     if setup.clearance_constraints is not None:
         base = "base" if machine.base_size else machine.base_home()
         setup.clearance_constraints.declare(problem, base, horizon=None if free else duration)
@@ -453,22 +463,3 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
         rows = [row for row in rows if row < 3] + [3, 4, 5]
     if rows:
         problem.end("base", gaps[rows], 0.0, 0.0, unit="m, rad")
-
-
-def _declare_tasks(
-    problem: Problem, equations: TaskEquations, ends: _Ends, motion: tuple[Any, Any, Any, Any], duration: float
-) -> None:
-    """Constrain the tip accelerations to those that tasks prescribe; declare the pose errors that the audit checks."""
-    base, joints, rates, second = motion
-    if not np.isnan(ends.first).any():
-        checked_tasks(equations, ends.base, ends.first, duration)
-    check_length(equations, ends.base, duration)
-    check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
-    targets = equations.targets(problem.time)
-    if not ends.rests[0]:
-        residual = equations.residual(base, joints, rates, targets)
-        problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, progress=(problem.time,))
-    problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.deviations(base, joints, rates, targets).items():
-        problem.watch(name, **deviation)

@@ -411,7 +411,7 @@ def unreachable_error(
     misses: tuple[float, float],
 ) -> Unreachable:
     """Return an error that inverse kinematics found no solution; `misses` are the distance, m, and angle, rad, left."""
-    names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
+    names = [part.name for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]
     where = f", with {at_limit} at their limits" if at_limit else ""

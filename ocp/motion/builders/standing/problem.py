@@ -229,13 +229,12 @@ def standing_problem(
     progress: tuple[Any, ...] = (problem.time,)
     if along_parameter:
         progress = _declare_progress(problem, rests, guess)
-    _constrain_tips(problem, equations, motion, progress, tip_level, not rests[0])
-
+    none = ca.DM(0, 1)
+    constrain_tips(problem, equations, (none, *motion), progress, moving=not rests[0], level=tip_level)
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _constrain_ground(problem, machine, motion, wrenches, zmp, limits)
     limit_torques(problem, machine.robot, machine.joint_torques(*motion, wrenches), bounds.torque)
 
-    none = ca.DM(0, 1)
     if setup.clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
         setup.clearance_constraints.declare(problem, none, horizon=known)
@@ -249,27 +248,30 @@ def standing_problem(
     return problem
 
 
-def _constrain_tips(
+def constrain_tips(
     problem: Problem,
     equations: TaskEquations,
-    motion: tuple[Any, Any, Any],
+    motion: tuple[Any, Any, Any, Any],
     progress: tuple[Any, ...],
-    tip_level: str,
+    *,
     moving: bool,
+    level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the poses or accelerations of their tasks, and to velocities at a `moving` start."""
-    none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
+    """Constrain the tips to the accelerations of their tasks, and to velocities at a `moving` start, or only to poses.
+
+    `motion` has base, joint positions, rates and accelerations.
+    """
     targets = equations.targets(*progress[:2])
-    if tip_level == "position":
-        gap = equations.gap(none, joints, velocities, targets)
+    if level == "position":
+        gap = equations.gap(*motion[:3], targets)
         problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""), tolerance=equations.tolerances)
         return
     if moving:
-        residual = equations.residual(none, joints, velocities, targets)
+        residual = equations.residual(*motion[:3], targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(none, joints, velocities, accelerations, progress=progress)
+    gap = equations.acceleration(*motion, progress=progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.deviations(none, joints, velocities, targets).items():
+    for name, deviation in equations.deviations(*motion[:3], targets).items():
         problem.watch(name, **deviation)
 
 
