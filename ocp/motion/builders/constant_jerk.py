@@ -43,15 +43,11 @@ NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 class ConstantJerkSettings:
     """Settings of motions that consist of phases of constant jerk."""
 
-    # duration of a motion that stays where it is, s, since the horizon of a problem must be positive
-    still: float = 1e-3
-    # time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a share of the
-    # time at that rate
-    ramp_share: float = 5e-4
+    still: float = 1e-3  # duration of a motion that stays where it is, s: a horizon must be positive
+    ramp_share: float = 5e-4  # time in which joints without acceleration and jerk limits speed up, per cruise time
     unlimited_rate: float = 1.0  # rate of joints without any of these limits, rad/s or m/s
     samples: int = 16  # number of samples of each phase at which torques are evaluated
-    # share of the limits of torque and power that is used there, since torques may be larger between the samples
-    torque_share: float = 0.995
+    torque_share: float = 0.995  # share of torque and power limits that is used, for larger values between the samples
 
 
 SETTINGS = ConstantJerkSettings()

@@ -138,12 +138,9 @@ class Actuation:
     """Options of a motion controlled by joint accelerations, or by jerks if these are limited or weighted."""
 
     cost: Cost | None = None  # weights of all terms but the time; None for half the squared rates
-    # whether the joints are at rest at the start and at the end; else they are free to move there
-    rests: tuple[bool, bool] = (False, False)
-    # rows (k, n) of the velocities that are zero at an end at rest, None for all: tasks may bring the tip to rest
-    end_rows: Any = None
-    # duration in which a control passes from limit to limit by a term of the cost, as a share of the horizon
-    smoothing: float = 1e-3
+    rests: tuple[bool, bool] = (False, False)  # whether the joints rest at the start and at the end
+    end_rows: Any = None  # rows (k, n) of the velocities that are zero at an end at rest; None for all
+    smoothing: float = 1e-3  # duration in which a control passes from limit to limit, as a share of the horizon
 
 
 def declare_actuators(

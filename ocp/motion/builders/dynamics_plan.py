@@ -182,11 +182,9 @@ class MeshSettings:
     """Settings of the search for a plan that satisfies its limits between the nodes of the mesh."""
 
     meshes: int = 3  # largest number of meshes, each finer than the one before
-    # number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth
-    splits: int = 3
+    splits: int = 3  # number of parts of an interval whose tightened limit costs too much
     excess: float = 1e-5  # largest excess of a limit between the nodes, in its own unit
-    # largest relative increase of the cost by tightened limits; above it, nodes at switches help more
-    cost_increase: float = 1e-3
+    cost_increase: float = 1e-3  # largest relative increase of the cost by tightened limits
 
 
 MESH_SETTINGS = MeshSettings()

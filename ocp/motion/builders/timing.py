@@ -54,14 +54,11 @@ class TimingSettings:
     degree: int = 7  # degree of the polynomials of a table
     accuracy: float = 1e-8  # largest error of a tabulated quantity, relative to its largest value
     smallest_cell: float = 1e-9  # width of an interval that is not halved further, relative to the whole
-    halvings: int = 40  # largest number of halvings of an interval
-    # points of an interval at which ratios to limits are evaluated, ten for each collocation point and node
-    points: int = 40
+    points: int = 40  # points of an interval at which ratios to limits are evaluated
     beside_jump: float = 1e-6  # distance of nodes from a jump of the path's derivatives, relative to the whole time
     same_node: float = 1e-7  # distance of nodes that count as one, relative to the whole time
     demand: float = 2e-4  # largest accepted relative excess of a limit in an interval
-    # largest accepted error of integration in an interval, relative to its distance and to the top speed
-    defect: float = 1e-6
+    defect: float = 1e-6  # largest error of integration in an interval, per distance and top speed
     parts: int = 8  # largest number of parts of an interval in one refinement
 
 
@@ -78,8 +75,7 @@ class TimingProblem:
     """
 
     problem: Problem
-    # nodes as fractions of the horizon, at the jumps of path derivatives and of the reference's jerk
-    mesh: tuple[float, ...]
+    mesh: tuple[float, ...]  # nodes as fractions of the horizon, at jumps of derivatives of path and reference
     units: tuple[float, float, float]  # largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3
     reference: SpeedProfile  # motion whose time is theta
     span: tuple[float, float]  # first and last theta of the problem, s; before and after, the jerk is constant
@@ -332,18 +328,14 @@ def table(columns: Columns, breaks: Array) -> Any:
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
-    finished: list[tuple[Array, Array]] = []
-    scale: Array | None = None
-    for number in range(TIMING.halvings):
-        if not start.size:
-            break
+    finished, scale = list[tuple[Array, Array]](), None
+    while start.size:
         places = np.concatenate([nodes, between])
         values = columns((start[:, None] + width[:, None] * places).ravel()).reshape(len(start), len(places), -1)
-        if scale is None:
-            scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
+        scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300) if scale is None else scale
         coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
         error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
-        fine = (error <= TIMING.accuracy * scale).all(axis=(1, 2)) | (number == TIMING.halvings - 1)
+        fine = (error <= TIMING.accuracy * scale).all(axis=(1, 2))
         fine |= width < TIMING.smallest_cell * (breaks[-1] - breaks[0])
         finished.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2

@@ -46,12 +46,10 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 class FeedbackSettings:
     """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost."""
 
-    # largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh
-    decay: float = 4.0
+    decay: float = 4.0  # largest decay of a pose error over a mesh interval, as a power of e
     intervals: int = 8  # least number of intervals of the mesh in a stretch
     closed_gap: float = 1e-6  # pose error at the beginning of a task below which there is no gap to close, m and rad
-    # velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s
-    relaxation: float = 1e-5
+    relaxation: float = 1e-5  # velocity error of a relaxed task, m/s or rad/s, that costs as much as 1 rad/s
 
 
 FEEDBACK = FeedbackSettings()
@@ -154,8 +152,7 @@ class ToolMotionSetup:
 
     base: Array  # configuration of the base at the start, (base_size,)
     start: Array | None  # configuration, nan or None where free if the tips are where their tasks begin, (joint_size,)
-    # configuration that satisfies the tasks at the start; there a free velocity task begins, (joint_size,)
-    reference: Array
+    reference: Array  # configuration that satisfies the tasks at the start, (joint_size,)
     cyclic: bool  # whether the joints end where they start
     weights: Array  # of the squared joint rates, (joint_size,)
     bounds: JointBounds  # limits of joint positions and rates

@@ -35,11 +35,8 @@ class NewtonSettings:
     exact: float = 1e-10  # largest pose error of a solution, also in rad
     rough: float = 0.5  # pose error above which a candidate is dropped, also in rad
     largest_step: float = 1.0  # largest change of a joint in a step, rad or m
-    # added to the squared singular values of the Jacobian, so that steps stay finite at singularities
-    damping: float = 1e-14
-    # least singular value of the Jacobian of a regular solution. Below it a further solution may lie so near that
-    # rounding errors hide it
-    singular: float = 1e-5
+    damping: float = 1e-14  # added to the squared singular values of the Jacobian: finite at singularities
+    singular: float = 1e-5  # least singular value of a regular solution; below it a further one may be hidden
     same: float = 1e-7  # distance below which two solutions count as one, rad or m
     near: float = 1e-2  # distance up to which two solutions count as one if the pose is exact halfway between them
 

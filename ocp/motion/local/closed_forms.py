@@ -43,8 +43,7 @@ class FormSettings:
     """Settings of closed-form inverse kinematics; lengths are relative to the size of the arm."""
 
     straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
-    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
-    near: float = 1e-3
+    near: float = 1e-3  # residual up to which rough solutions, as near double ones, are refined
     vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
     nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
     # solutions that a solver may have missed at a pose are searched by solving for poses nearby

@@ -31,8 +31,7 @@ class Collision(NamedTuple):
     bodies: tuple[str, str]
     distance: float  # m, negative if they overlap
     time: float  # s
-    # how much closer the bodies are that cover meshes and that separation constraints use instead, m
-    protrusion: float = 0.0
+    protrusion: float = 0.0  # how much closer the bodies are that cover meshes in separation constraints, m
 
     def __str__(self) -> str:
         how = f"overlap by {-self.distance:.3g} m" if self.distance < 0 else f"are {self.distance:.3g} m apart"
@@ -175,12 +174,10 @@ class SlidingSettings:
     """Settings of `slide_apart`, which moves configurations out of collision along self-motions."""
 
     steps: int = 12  # largest number of steps
-    # step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m
-    difference: float = 1e-5
+    difference: float = 1e-5  # step of the finite differences, rad or m: the root of the rounding error of distances
     longest: float = 0.25  # longest step of a joint, rad or m
     damping: float = 0.1  # damping relative to the size of the gradients
-    # distance in excess of the clearance, so that correcting the tips does not use up the clearance, m
-    spare: float = 2e-3
+    spare: float = 2e-3  # distance beyond the clearance that correcting the tips may use up, m
 
 
 SLIDING = SlidingSettings()

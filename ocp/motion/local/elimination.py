@@ -31,11 +31,9 @@ from models.spatial import rotation_matrices
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
+# angles h at which a function is sampled to find its coefficients of 1, cos h and sin h
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
-"""Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
-
-
 # coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2
 PRODUCTS = np.array(
     [[[1, 0, 0, 0], [0, 1, 0, 0]], [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]], [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]]
@@ -48,17 +46,12 @@ class EliminationSettings:
 
     rank: float = 1e-9  # singular values of the eliminated products below this share of the largest count as zero
     regular: float = 1e-11  # reciprocal condition number below which an eigenvalue problem counts as singular
-    # distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double eigenvalues
-    # of an ill-conditioned problem
-    real: float = 3e-2
+    real: float = 3e-2  # distance of exp(i h) from the unit circle below which an angle h may be real
     probably_real: float = 1e-4  # distance below which a multiple eigenvalue counts as real
     surely_real: float = 1e-7  # distance below which a simple eigenvalue is real
-    # deviation of an eigenvector from the products of one solution below which its eigenvalue is simple
-    simple: float = 1e-4
-    # angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken
-    poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
-    # distance of a solution from a configuration of the trial below which they are the same, rad or m
-    same: float = 1e-5
+    simple: float = 1e-4  # deviation of an eigenvector from products below which its eigenvalue is simple
+    poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)  # angles h at which the half-angle may be infinite
+    same: float = 1e-5  # distance of a solution from a configuration of the trial to be the same, rad or m
     trials: int = 12  # number of random configurations of the trial
     openings: int = 3  # largest number of eigenvalue problems that are solved at a doubtful pose
     seed: int = 0  # seed of the trial
@@ -100,8 +93,7 @@ class LoopOpening(NamedTuple):
 
     first: int  # index of the joint x; the others follow in the order of the loop
     rank: int  # number of independent products of x and y at a regular pose
-    # which of z, a, b is the eigenvalue, which has products with half-angles, and which remains
-    roles: tuple[int, int, int]
+    roles: tuple[int, int, int]  # which of z, a, b has the eigenvalue, half-angles, and the rest
 
 
 class _Loop(NamedTuple):

@@ -36,8 +36,7 @@ class IkSettings:
     most_damping: float = 1e8  # damping at which a start is abandoned
     growth: float = 4.0  # factor of the damping after a step that fails
     shrinkage: float = 0.25  # factor of the damping after a step that succeeds
-    # number of solutions in collision that are moved along their self-motions if no solution is free
-    slide_count: int = 8
+    slide_count: int = 8  # number of solutions in collision that are moved along their self-motions
 
 
 IK_SETTINGS = IkSettings()

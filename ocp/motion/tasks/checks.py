@@ -26,11 +26,9 @@ class CheckSettings:
     track_samples: int = 201  # of a track, a target over time
     closure_samples: int = 2001  # of a closed track: odd, for Simpson's rule
     closed: float = 1e-6  # largest gap of a closed path, m and rad
-    # relative change of the required joint rates below which a joint position counts as without effect
-    ignorable: float = 1e-9
+    ignorable: float = 1e-9  # relative change of required joint rates below which a joint position has no effect
     ignorable_samples: int = 4  # number of random configurations in which that is evaluated
-    # tolerance of a joint limit, relative to the range between the limits; without one, to the limit (at least 1)
-    rounding: float = 1e-9
+    rounding: float = 1e-9  # tolerance of a joint limit, per range between the limits or limit (at least 1)
     still: float = 1e-6  # largest task velocity where the joints are to be at rest, m/s and rad/s
 
 

@@ -27,8 +27,7 @@ class NodeSettings:
     samples: int = 4  # between two breaks at which the targets are compared with their interpolants
     pose_error: float = 1e-6  # largest error of an interpolated position, rotation matrix or direction, m and 1
     rate_error: float = LIMIT_SHARE / 2  # largest error of an interpolated velocity, relative to its largest value
-    # largest distance of a pose from the chord of a time step, m and 1: two Newton steps correct that error
-    chord_error: float = 1e-3
+    chord_error: float = 1e-3  # largest distance of a pose from the chord of a time step, m and 1
 
 
 NODES = NodeSettings()

@@ -51,8 +51,7 @@ class PaceSettings:
     guess: float = 5.0  # guess of a duration, over the requested one
     longest: float = 50.0  # upper bound of a duration, over the requested one
     samples: int = 21  # number of samples of a phase at which active limits are searched
-    # distance of a quantity from its limit, over its range along the motion, at which this counts as active
-    active: float = 0.01
+    active: float = 0.01  # distance from a limit, per range along the motion, at which it counts as active
     names: int = 3  # largest number of limits named in a message
 
 

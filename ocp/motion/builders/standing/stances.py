@@ -220,9 +220,7 @@ class ConfigurationSettings:
     """Settings of the search for a standing configuration."""
 
     near: float = 1.0  # weight of a joint's squared distance from its initial position, 1/rad^2
-    # weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of a
-    # radian
-    over: float = 300.0
+    over: float = 300.0  # weight of the squared distance of the center of mass from its goal, 1/m^2
     gap: float = 1e-9  # largest gap between a foot and its foothold, m or rad
     steps: int = 40  # number of time steps in the guess of a phase
 
