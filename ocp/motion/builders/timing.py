@@ -201,7 +201,7 @@ def minimum_time_problem(
         message = f"the guess is for a path of {guess.path.length:g} m, but this path has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
     path_columns(path, limits, limited, path.sample_distances())  # raises if anything is not finite
-    reference = reference_motion(path, limits, limited) if guess is None else guess.profile
+    reference = schedule(path, limits, joints=limited).profile if guess is None else guess.profile
     if guess is not None and limited is not None:
         check_smooth(path, limits, limited)  # raises, like a schedule, if no motion satisfies the limits
     whole = reference.duration
@@ -394,22 +394,6 @@ def _bernstein(x: Array) -> Array:
     return np.stack(
         [comb(TIMING.degree, i) * x**i * (1 - x) ** (TIMING.degree - i) for i in range(TIMING.degree + 1)], axis=1
     )
-
-
-def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return a speed profile within all limits along a path, from `schedule` or, if that fails, a slower profile."""
-    try:
-        return schedule(path, limits, joints=joints).profile
-    except ProblemError:
-        check_smooth(path, limits, joints)  # raises if no motion satisfies the limits
-    quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
-    # slowed down by a factor: velocities shrink with it, accelerations with its square, jerks with its cube
-    motion = quick.at(quick.duration * np.linspace(0, 1, 2001))
-    rows = limit_rows(path, limits, joints, motion.distance, torques=False)
-    ends = np.cumsum([kind.shape[1] for kind in rows])[:-1]
-    kinds = np.split(np.abs(rows.usage(motion)), ends, axis=1)
-    c = 1.05 * max(float(kind.max(initial=1.0)) ** (1 / (order + 1)) for order, kind in enumerate(kinds))
-    return SpeedProfile(quick.t * c, quick.distance, quick.speed / c, quick.acceleration / c**2, quick.jerk / c**3)
 
 
 def distinct(values: Array, tolerance: float) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -278,30 +278,19 @@ class Chain:
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
-    if not len(pose) or pose[0] == pose[-1]:
-        return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]
-    second = first + np.arange(1, int(np.bincount(pose).max()))
+    second = first + np.arange(1, int(np.bincount(pose, minlength=1).max()))
     same_pose = second < len(pose)
     second = np.minimum(second, len(pose) - 1)
     first, second = (part[same_pose & (pose[first] == pose[second])] for part in np.broadcast_arrays(first, second))
     return first, second
 
 
-@lru_cache(maxsize=64)
-def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and the second elements of all pairs of the numbers 0 to count - 1. Shapes (P,)."""
-    return np.triu_indices(count, 1)
-
-
 def _damped_steps(jacobian: Array, missed: Array) -> Array:
     """Return the joint steps (K, m) of Newton's method for pose errors (K, 6), damped at singularities."""
-    transposed, error = jacobian.transpose(0, 2, 1), missed[:, :, None]
-    if jacobian.shape[2] < 6:
-        normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
-        return np.asarray(np.linalg.solve(normal, transposed @ error)[:, :, 0])
-    normal = jacobian @ transposed + NEWTON.damping * np.eye(6)
-    return np.asarray((transposed @ np.linalg.solve(normal, error))[:, :, 0])
+    transposed = jacobian.transpose(0, 2, 1)
+    normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
+    return np.asarray(np.linalg.solve(normal, transposed @ missed[:, :, None])[:, :, 0])
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:

@@ -222,7 +222,14 @@ def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[C
     """Return the closed-form solvers of a chain, one for each choice of redundant, `lockable` joints that has one."""
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
-    return _six_joint_forms(chain, chain.order if lockable is None else tuple(lockable))
+    n, forms = len(chain.order), list[ClosedForm]()
+    for redundant in combinations(chain.order if lockable is None else lockable, n - SIX) if n >= SIX else ():
+        if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
+            continue
+        triples = [chain.order[i : i + 3] for i in range(n - 2)]
+        kinds = [(_kind_of(chain, triple), triple) for triple in triples if not set(triple) & set(redundant)]
+        forms += [ClosedForm(chain, redundant, kind, triple) for kind, triple in sorted(kinds) if kind][:1]
+    return tuple(forms)
 
 
 def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
@@ -238,18 +245,6 @@ def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
 def is_scara(chain: Chain) -> bool:
     """Return whether a chain is a SCARA: three parallel revolute joints and a prismatic one along them."""
     return len(chain.order) == SCARA and bool(_scara_forms(chain))
-
-
-def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers with six free revolute joints, one for each suitable set of redundant joints."""
-    n, forms = len(chain.order), list[ClosedForm]()
-    for redundant in combinations(lockable, n - SIX) if n >= SIX else ():
-        if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
-            continue
-        triples = [chain.order[i : i + 3] for i in range(n - 2)]
-        kinds = [(_kind_of(chain, triple), triple) for triple in triples if not set(triple) & set(redundant)]
-        forms += [ClosedForm(chain, redundant, kind, triple) for kind, triple in sorted(kinds) if kind][:1]
-    return tuple(forms)
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
