@@ -278,8 +278,10 @@ class Chain:
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
+    if not len(pose) or pose[0] == pose[-1]:
+        return np.triu_indices(len(pose), 1)
     first = np.arange(len(pose))[:, None]
-    second = first + np.arange(1, int(np.bincount(pose, minlength=1).max()))
+    second = first + np.arange(1, int(np.bincount(pose).max()))
     same_pose = second < len(pose)
     second = np.minimum(second, len(pose) - 1)
     first, second = (part[same_pose & (pose[first] == pose[second])] for part in np.broadcast_arrays(first, second))

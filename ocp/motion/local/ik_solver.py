@@ -267,20 +267,24 @@ class ArmSolver:
         count, samples, redundant = len(positions), len(shares), list(solver.redundant)
         if self.free is ToolFreedom.ROTATION:  # any rotation at which the added joints are not singular
             rotations = np.tile(rotation_matrices(np.array([0.3, 0.5, 0.7])), (count, 1, 1))
-        low, high = sampling_range(self.lower[redundant], self.upper[redundant], self.chain.revolute[redundant])
-        prescribed = np.tile(low + shares[:, : len(redundant)] * (high - low), (count, 1))
+        prescribed = shares[:, : len(redundant)]
+        if redundant:
+            low, high = sampling_range(self.lower[redundant], self.upper[redundant], self.chain.revolute[redundant])
+            prescribed = low + prescribed * (high - low)
         if self.sampled_angles:
             rotations = (rotations[:, None] @ self._rotations(shares[:, len(redundant) :])).reshape(-1, 3, 3)
-        else:
+        elif samples > 1:
             rotations = np.repeat(rotations, samples, axis=0)
-        goal = Motion(rotations, np.repeat(positions, samples, axis=0))
-        solutions, doubtful = solver.solve(goal.shift, goal.turn, prescribed)
+        goal = Motion(rotations, np.repeat(positions, samples, axis=0) if samples > 1 else positions)
+        solutions, doubtful = solver.solve(goal.shift, goal.turn, np.tile(prescribed, (count, 1)))
         solutions = self._within_limits(self._of_the_arm(solver, solutions, goal), turns)
         pose, joints = solutions.pose // samples, solutions.joints
-        order = np.argsort(pose, kind="stable")
-        pose, joints = pose[order], joints[order]
-        idle = np.isin(np.arange(len(self.lower)), self.chain.order, invert=True)
-        joints[:, idle] = idle_positions(self.lower, self.upper)[idle]
+        if count > 1:
+            order = np.argsort(pose, kind="stable")
+            pose, joints = pose[order], joints[order]
+        if len(self.chain.order) < joints.shape[1]:
+            idle = np.isin(np.arange(len(self.lower)), self.chain.order, invert=True)
+            joints[:, idle] = idle_positions(self.lower, self.upper)[idle]
         reasons = [Incompleteness(0) if self.complete else Incompleteness.SAMPLED] * count
         for k in set((solutions.pose[solutions.singular] // samples).tolist()):
             reasons[k] |= Incompleteness.SINGULAR
