@@ -16,12 +16,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing
+from models import FixedBase, FreeFloating, Machine, Robot, Standing
 from models.checks import Array
 from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars, rotation_from_quaternion
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, closing_combinations, cross_product
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
@@ -440,12 +440,10 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
         raise ProblemError("task is an empty list; give a TipTask, or several", name="task", value=listed)
     bound = []
     for task in listed:
-        try:
+        with problem_errors():
             tip = with_tip(machine, task.link, task.point) if task.link is not None else machine
             _ = tip.robot.tip_link
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
         bound.append(BoundTask(task, tip, reference))
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 

@@ -34,9 +34,7 @@ class InFoot:
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (is_finite(self.margin) and self.margin >= 0):
-            words = f"InFoot: margin must be a finite number of m, not negative, not {self.margin!r}"
-            raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
+        require.nonnegative("InFoot: margin", self.margin, unit="m")
 
     def check(self, machine: Standing) -> None:
         """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""

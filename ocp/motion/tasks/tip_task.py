@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
+from models import FreeFloating, Machine, SmoothPath, center_of_mass
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, skew
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
@@ -102,8 +102,8 @@ class TipTask:
         require.choice("axes", self.axes, get_args(Axes))
         for attribute in ("link", "relative_to"):
             name = getattr(self, attribute)
-            if name is not None and not require.text(f"tip task: {attribute}", name):
-                raise ProblemError(f"tip task: {attribute} is an empty name", name=attribute, value=name)
+            if name is not None:
+                require.name(f"tip task: {attribute}", name)
         for attribute in ("gain", "start_gap", "begin"):
             require.nonnegative(attribute, getattr(self, attribute))
         if self.duration is not None:
@@ -113,24 +113,19 @@ class TipTask:
             if self.direction is None:
                 words = "within is an angle about a direction: give direction=... too"
                 raise ProblemError(words, name="within", value=self.within)
-        try:
-            axis = require.array("tip task: tool_axis", self.tool_axis, (3,))
-            object.__setattr__(self, "point", require.array("tip task: point", self.point, (3,)))
-            object.__setattr__(self, "rows", self._checked_rows())
-            object.__setattr__(self, "breaks", self._checked_breaks())
-            pair = require.array("tip task: tolerance", self.tolerance, (2,))
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
+        axis = require.array("tip task: tool_axis", self.tool_axis, (3,))
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
+        pair = require.array("tip task: tolerance", self.tolerance, (2,), sign="positive", meaning="m and rad")
+        object.__setattr__(self, "tolerance", tuple(pair.tolist()))
         object.__setattr__(self, "tool_axis", axis / np.linalg.norm(axis))
+        object.__setattr__(self, "point", require.array("tip task: point", self.point, (3,)))
+        object.__setattr__(self, "breaks", self._checked_breaks())
+        with problem_errors():
+            object.__setattr__(self, "rows", self._checked_rows())
         if self.direction is not None and not callable(self.direction) and _is_zero(self.direction):
             words = f"direction {np.ravel(self.direction).tolist()} has no length; say where the tool axis shall point"
             raise ProblemError(words, name="direction", value=self.direction)
-        if not (pair > 0).all():
-            words = f"tip task: tolerance must be two positive numbers, m and rad, not {self.tolerance!r}"
-            raise ProblemError(words, name="tolerance", value=self.tolerance)
-        object.__setattr__(self, "tolerance", tuple(pair.tolist()))
         if self.link is None and np.any(self.point):
             words = "a point is given in the frame of a link: name the link too"
             raise ProblemError(words, name="point", value=self.point)
