@@ -29,17 +29,15 @@ from ocp.indirect.method import Indirect
 from ocp.methods import Certificate, certificate, prepare, solve
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, joint_torques
 from ocp.motion.builders.dynamics_plan import dynamics_phases
 from ocp.motion.builders.joint_motion import VelocitySetup, minimum_velocity_problem
 from ocp.motion.builders.joint_spline import joint_path
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_problem, chained_capture
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
-from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
-from ocp.motion.builders.standing.steps import StepWeights, steps_problem
+from ocp.motion.builders.standing.steps import StepsMotion, StepWeights, resolve_steps, steps_motion, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
-from ocp.motion.builders.torques import JointFriction, joint_torques
 from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics

@@ -21,8 +21,8 @@ from models import Foot, Foothold, FreeFloating, Joint, Link, Robot, VisualShape
 from models.checks import Array
 from ocp import Audit, Limits, Solution
 from ocp.app.view.appearance import frames_along
-from ocp.motion.builders.standing.resolved import StepsMotion, resolve_steps, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
+from ocp.motion.builders.standing.steps import StepsMotion, resolve_steps, steps_motion
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from models import Foot, Robot
 from models.checks import Array
-from ocp.motion.builders.standing.resolved import StepsMotion
 from ocp.motion.builders.standing.stances import Steps
+from ocp.motion.builders.standing.steps import StepsMotion
 from scripts.drawing import COLORS
 from scripts.robots.drawing import animate, page
 from scripts.robots.robots import TALOS

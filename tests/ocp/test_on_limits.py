@@ -14,7 +14,7 @@ from models import FixedBase, Joint, Robot, planar_chain
 from models.checks import Array
 from ocp import DynamicsSetup, Goal, Limits, Problem, ProblemError, TipTask, minimum_velocity_problem, plan
 from ocp.errors import format_distinct
-from ocp.motion.builders.dynamics_plan import solve_dynamics
+from tests.ocp.motion.goal_solves import solve_goals
 
 LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
 
@@ -40,11 +40,11 @@ def planned(joints: Array) -> float:
 
 
 def moved(joints: Array) -> float:
-    return float(solve_dynamics(MACHINE, Goal(joints=[0.3, 0.9]), 1.0, start=joints).at(0.0)["joints"][0])
+    return float(solve_goals(MACHINE, Goal(joints=[0.3, 0.9]), 1.0, start=joints).at(0.0)["joints"][0])
 
 
 def arrived(joints: Array) -> float:
-    return float(solve_dynamics(MACHINE, Goal(joints=joints), 1.0, start=[0.3, 0.9]).at(1.0)["joints"][0])
+    return float(solve_goals(MACHINE, Goal(joints=joints), 1.0, start=[0.3, 0.9]).at(1.0)["joints"][0])
 
 
 def declared(joints: Array) -> float:
@@ -64,10 +64,10 @@ def test_a_joint_beyond_its_limit_by_rounding_is_on_it(entry: Callable[[Array], 
 def test_velocities_beyond_their_limit_by_rounding_are_on_it() -> None:
     goal, limits = Goal(joints=[1.5, 0.9]), Limits(velocity=1.1)
     setup = DynamicsSetup(start_velocity=[np.nextafter(1.1, 2), 0.0])
-    fast = solve_dynamics(MACHINE, goal, 2.0, start=[0.3, 0.9], limits=limits, setup=setup)
+    fast = solve_goals(MACHINE, goal, 2.0, start=[0.3, 0.9], limits=limits, setup=setup)
     assert fast.at(0.0)["velocities"][0] == pytest.approx(1.1, abs=1e-9)
     with pytest.raises(ProblemError, match=r"'joint1' starts at 1\.1000001, outside its limits -1\.1 \.\. 1\.1;"):
-        solve_dynamics(
+        solve_goals(
             MACHINE, goal, 2.0, start=[0.3, 0.9], limits=limits, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0])
         )
 

@@ -30,12 +30,9 @@ from ocp.solution import Solution
 
 CLEARANCE, APART = "clearance", "apart"
 """Name prefixes of the clearances that the audit proves (CLEARANCE) and of separation constraints (APART)."""
-ROUNDING = 3e-3
-"""Width of the smoothing of distances in separation constraints, m; see `rounding` of `models.shapes.distance`."""
-MAX_SOLVES = 6
-"""Largest number of solves of one motion; after each solve, the bodies that collide get separation constraints."""
-MARGIN = 5e-5
-"""First margin by which separated bodies must exceed the clearance, and least increase of such a margin, m."""
+ROUNDING = 3e-3  # width of the smoothing of distances in separation constraints, m; see `models.shapes.distance`
+MAX_SOLVES = 6  # largest number of solves of a motion, after each of which bodies that collide are separated
+MARGIN = 5e-5  # first margin of separated bodies beyond the clearance, and least increase of it, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +95,6 @@ class ClearanceConstraints:
         """Add to a problem the clearances that the audit shall prove, and the separation constraints.
 
         Args:
-            problem: Problem with the states below.
             base: Name of the state of the base, or the configuration of a fixed base.
             joints: Name of the state of the joint positions.
             suffix: Suffix of the declared names.
@@ -155,15 +151,10 @@ def clearance_of(
     smooth: bool,
     pairs: Sequence[int] | None = None,
 ) -> Clearance:
-    """Prove the clearance of each pair of bodies during a motion of a machine on a fixed base among fixed obstacles.
+    """Prove the clearances of pairs of bodies, all if None, in a motion on a fixed base among fixed obstacles.
 
-    Args:
-        joints: Function of fractions of the horizon (M,) that returns joint positions (M, n).
-        breaks, horizon, rates, seconds, smooth: Properties of this function, see `ocp.audit.clearance.Track`.
-        pairs: Indices of the only pairs that count; all if None.
-
-    Raises:
-        ModelError: A prismatic joint has no limits.
+    `joints` returns joint positions (M, n) at fractions of the horizon (M,), with the properties that
+    `ocp.audit.clearance.Track` describes.
     """
     machine, levers, n = scene.machine, scene.levers, len(scene.pairs)
     q = ca.SX.sym("q", machine.joint_size)
@@ -203,12 +194,10 @@ def solve_with_clearance(
 ) -> Solution:
     """Solve a problem repeatedly; after each solve, add separation constraints for the bodies that collide.
 
-    Args:
-        clearance_constraints: Clearance constraints of the first solve; None for no collision avoidance.
-        run: Solves and audits. It raises a SolveError named after a clearance if that is the solution's only failure.
+    `run` solves and audits. It raises a SolveError named after a clearance if that is the solution's only failure.
 
     Raises:
-        SolveError: As ``run``; or the bodies cannot be separated: names them with place and time.
+        SolveError: As `run`; or the bodies cannot be separated: names them with place and time.
     """
     collision: SolveError | None = None
     for _ in range(MAX_SOLVES):

@@ -6,10 +6,6 @@ sped up. With the largest acceleration a that it reaches, its peak velocity is a
 
     d = peak (2 t_j + t_a + t_v).
 
-A motion of several joints takes at least as long as each joint by itself. `synchronised_motion` attains this bound: by
-a straight motion in joint space if the limits of all joints allow it, else by slowing down the profile of each joint to
-the common duration. Without jerk limits the phases have constant acceleration.
-
 Without friction, torques of a motion that is slowed down by a factor f are
 
     torque(q, rate / f, acceleration / f^2) = rest(q) + (torque(q, rate, acceleration) - rest(q)) / f^2,
@@ -31,7 +27,7 @@ from models import FixedBase
 from models.checks import Array
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import SolveError, SolverStatus
-from ocp.motion.builders.torques import joint_torques
+from ocp.motion.builders.dynamics import joint_torques
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
@@ -47,15 +43,11 @@ NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 class ConstantJerkSettings:
     """Settings of motions that consist of phases of constant jerk."""
 
-    # duration of a motion that stays where it is, s, since the horizon of a problem must be positive
-    still: float = 1e-3
-    # time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a share of the
-    # time at that rate
-    ramp_share: float = 5e-4
+    still: float = 1e-3  # duration of a motion that stays where it is, s: a horizon must be positive
+    ramp_share: float = 5e-4  # time in which joints without acceleration and jerk limits speed up, per cruise time
     unlimited_rate: float = 1.0  # rate of joints without any of these limits, rad/s or m/s
     samples: int = 16  # number of samples of each phase at which torques are evaluated
-    # share of the limits of torque and power that is used there, since torques may be larger between the samples
-    torque_share: float = 0.995
+    torque_share: float = 0.995  # share of torque and power limits that is used, for larger values between the samples
 
 
 SETTINGS = ConstantJerkSettings()
@@ -98,31 +90,16 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least time in which each joint by itself moves by a given distance from rest to rest within limits.
-
-    Args:
-        distances: Absolute distances, rad or m. Shape (..., n).
-        bounds: Limits of the joints; those of velocity, acceleration and jerk apply.
-
-    Returns:
-        Durations, s; 0 for a joint without limits. Shape (..., n).
-    """
+    """Return the least time, s, in which each joint by itself moves by a distance from rest to rest. Shape (..., n)."""
     return _ramps(distances, bounds.velocity, bounds.acceleration, bounds.jerk).duration
 
 
 def least_squared_velocities(distances: Array, duration: float, acceleration: Array) -> Array:
-    """Return the least integral of the squared velocity of each joint alone, from rest to rest in a given time.
+    """Return the least integral of each joint's squared velocity, from rest to rest over distances d. Shape (..., n).
 
-    Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity
-    v = 2 d / (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a).
-
-    Args:
-        distances: Absolute distances d, rad or m. Shape (..., n).
-        duration: Duration T of the motion, s.
-        acceleration: Largest accelerations a, infinite if not limited. Shape (n,).
-
-    Returns:
-        Integrals, inf where the duration is too short. Shape (..., n).
+    Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity v = 2 d /
+    (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a). It is infinite where the
+    duration T is too short.
     """
     root = np.sqrt(np.maximum(duration**2 - 4 * distances / acceleration, 0.0))
     velocity = np.divide(2 * distances, duration + root, out=np.zeros_like(root), where=distances > 0)
@@ -132,15 +109,10 @@ def least_squared_velocities(distances: Array, duration: float, acceleration: Ar
 
 @dataclass(frozen=True, eq=False)
 class ConstantJerkMotion:
-    """Motion of several joints in consecutive phases of constant jerk.
+    """Motion of several joints in K consecutive phases of constant jerk."""
 
-    Attributes:
-        durations: Durations of the phases, s. Shape (K,).
-        joints, rates, accelerations, jerks: Joint positions and derivatives where each phase starts. Shape (K, n).
-    """
-
-    durations: Array
-    joints: Array
+    durations: Array  # of the phases, s, (K,)
+    joints: Array  # positions where each phase starts, (K, n), as the derivatives
     rates: Array
     accelerations: Array
     jerks: Array
@@ -156,10 +128,7 @@ class ConstantJerkMotion:
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return joint positions, rates and accelerations at fractions (M,) of the duration of each phase.
-
-        Shape (K, M, n) each.
-        """
+        """Return joint positions, rates and accelerations (K, M, n) at fractions (M,) of each phase's duration."""
         t = (self.durations[:, None] * places)[:, :, None]
         joints, rates, accelerations, jerks = (
             each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
@@ -171,53 +140,65 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion in the form of a solution of a `dynamics_problem`, but without multipliers.
+        """Return the motion as a solution of a `dynamics_problem` without the control "power", and without multipliers.
 
-        Args:
-            problem: The problem, which must not have the control "power".
-            method: Phrase for what the motion does, such as "stops at the corners of a path".
+        `method` is a phrase for what the motion does, such as "stops at the corners of a path".
         """
         form, horizon = Formulation.of(problem), self.duration
         breaks = np.append(0.0, np.cumsum(self.durations)) / horizon
         breaks[-1] = 1.0
-        curves = dict(zip(("joints", "velocities", "accelerations"), self.sampled(NODES), strict=True))
-        states = np.concatenate([curves[name] for name in form.states], axis=2)
+        samples = dict(zip(("joints", "velocities", "accelerations"), self.sampled(NODES), strict=True))
+        states = np.concatenate([samples[name] for name in form.states], axis=2)
         constant = self.jerks if "jerks" in form.controls else self.accelerations
         state_curve = PiecewisePolynomial(breaks, NODES, states)
         control_curve = PiecewisePolynomial(breaks, np.array([0.5]), constant[:, None])
-        rows = np.concatenate([states[:, 0], states[-1:, -1]])
-        controls = np.concatenate([constant, constant[-1:]])
+        costate_curve = PiecewisePolynomial(breaks, NODES, np.zeros_like(states))
         p = form.parameter_vector({})
         nodes, weights = np.polynomial.legendre.leggauss(5)
         at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
         shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
         running = form.sampled([form.running], state_curve(at), control_curve(at), at * horizon, horizon, p)[0][:, 0]
-        final = form.terminal_cost(rows[-1], rows[0], controls[0], horizon=horizon, p=p)
-        columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
-        return Solution(
-            name=problem.name,
-            method={"type": method},
-            solver="path",
-            success=False,
-            status=SolverStatus.ACCEPTABLE,
-            message=f"it {method}, without multipliers that show whether it is optimal",
-            cost=float(horizon * shares @ running + final),
-            iterations=0,
-            horizon=horizon,
-            t=breaks * horizon,
-            states={name: rows[:, part] for name, part in columns.items()},
-            controls=dict.fromkeys(form.controls, controls),
-            costates={name: np.zeros_like(rows[:, part]) for name, part in columns.items()},
-            parameters={},
-            cost_gradients={},
-            state_interpolant=state_curve,
-            control_interpolant=control_curve,
-            costate_interpolant=PiecewisePolynomial(breaks, NODES, np.zeros_like(states)),
-            variables=states.ravel(),
-            multipliers=np.zeros(0),
-            seconds={"build": 0.0, "solve": 0.0},
-            problem=problem,
-        )
+        final = form.terminal_cost(states[-1, -1], states[0, 0], constant[0], horizon=horizon, p=p)
+        cost = float(horizon * shares @ running + final)
+        message = f"it {method}, without multipliers that show whether it is optimal"
+        curves = state_curve, control_curve, costate_curve
+        return path_solution(problem, method, curves, horizon=horizon, cost=cost, message=message)
+
+
+def path_solution(
+    problem: Problem, method: str, curves: tuple[PiecewisePolynomial, ...], *, horizon: float, cost: float, message: str
+) -> Solution:
+    """Return a motion that no solver computed, given by curves of states, control and costates, as a solution.
+
+    `message` says why its optimality is open; it is empty if the motion is optimal.
+    """
+    form = Formulation.of(problem)
+    columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
+    states, controls, costates = (np.concatenate([curve.values[:, 0], curve.values[-1:, -1]]) for curve in curves)
+    return Solution(
+        name=problem.name,
+        method={"type": method},
+        solver="path",
+        success=not message,
+        status=SolverStatus.ACCEPTABLE if message else SolverStatus.SOLVED,
+        message=message,
+        cost=cost,
+        iterations=0,
+        horizon=horizon,
+        t=curves[0].breaks * horizon,
+        states={name: states[:, part] for name, part in columns.items()},
+        controls=dict.fromkeys(form.controls, controls),
+        costates={name: costates[:, part] for name, part in columns.items()},
+        parameters={},
+        cost_gradients={},
+        state_interpolant=curves[0],
+        control_interpolant=curves[1],
+        costate_interpolant=curves[2],
+        variables=states.ravel(),
+        multipliers=np.zeros(0),
+        seconds={"build": 0.0, "solve": 0.0},
+        problem=problem,
+    )
 
 
 class TorqueLimits:
@@ -244,11 +225,7 @@ class TorqueLimits:
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the limited torques, then the limited powers, at M samples of a motion, and their Jacobians.
-
-        The Jacobians are those with respect to joint positions, rates and accelerations. Shapes (M, R), and (M, R, n)
-        for each Jacobian.
-        """
+        """Return the limited torques, then powers (M, R), and their Jacobians in position, rate and acceleration."""
         values, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
         return values, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
@@ -264,9 +241,7 @@ class TorqueLimits:
         return self._samplers[linearised]
 
     def slow_down(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
-        """Return the motion slowed down by the smallest factor at which its samples satisfy the torque limits.
-
-        If they then exceed power limits, the motion is slowed down further.
+        """Return the motion slowed down by the smallest factor at which its samples satisfy torque and power limits.
 
         Raises:
             SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
@@ -300,11 +275,8 @@ class TorqueLimits:
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
     """Return a time-optimal joint motion from rest to rest within velocity, acceleration and jerk limits.
 
-    It is straight if a straight motion attains the least time.
-
-    Args:
-        start, goal: Configurations, rad or m. Shape (n,).
-        bounds: Limits of the joints.
+    A motion takes at least as long as each joint by itself. A straight motion in joint space attains this bound if the
+    limits of all joints allow it, else the profile of each joint is slowed down to the common duration.
     """
     change = goal - start
     own = _ramps(np.abs(change), *_finite_limits(np.abs(change), bounds))
@@ -316,13 +288,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
 
 
 def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
-    """Return a motion within joint and torque limits that follows a joint path (M, n) and stops at each corner.
-
-    Each segment is the fastest without torque limits, slowed down to them.
-
-    Raises:
-        SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
-    """
+    """Return a motion along a joint path (M, n) that stops at each corner, slowed down to the torque limits."""
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
     parts = [torques.slow_down(_straight_motion(first, last - first, bounds)) for first, last in pairwise(corners)]
@@ -332,10 +298,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the least durations, s, of straight rest-to-rest motions in joint space without torque limits.
-
-    Shape (K,) for changes of the joint positions of shape (K, n).
-    """
+    """Return the least durations, s, (K,) of straight rest-to-rest motions by (K, n) without torque limits."""
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 

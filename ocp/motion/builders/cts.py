@@ -1,13 +1,9 @@
 """Optimal control of the roll, the redundant angle of the captive trajectory rig, along a whole tool trajectory.
 
-The paper, Lee, Lee 2017, resolves each target by itself, with the change of roll since the last target in the index
-(38); its roll lags behind the targets. Here the integral of the index I1, see `models.cts.roll`, and of the squared
-roll rate is minimised over all targets together.
-
-The first guess chooses the homotopy class. The rolls of least index of single targets may lie inside an obstacle, or
-jump from one side of it to the other, and from such a guess the solver finds no plan. Therefore dynamic programming
-over a grid of rolls and times finds the roll of least total cost, with penalties for targets out of reach, limits and
-clearance. The result is refined on finer and finer grids about it.
+The paper, Lee, Lee 2017, resolves each target by itself; its roll lags behind the targets. Here the integral of the
+index I1, see `models.cts.roll`, and of the squared roll rate is minimised over all targets together. The first guess
+chooses the homotopy class: dynamic programming over a grid of rolls and times finds the roll of least total cost, with
+penalties for targets out of reach, limits and clearance, and is refined on finer grids about it.
 """
 
 from __future__ import annotations
@@ -156,21 +152,17 @@ def roll_problem(
 ) -> Problem:
     """Declare the optimal control problem of the rig's redundant angle (roll) along a trajectory of tool targets.
 
-    The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v.
-    The states are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints
-    "reach" (sin q4 and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from
-    obstacles.
+    The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v. The states
+    are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints "reach" (sin q4
+    and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from obstacles. The
+    guess is the roll of least cost on a grid of rolls and times.
 
     Args:
-        rig, tunnel: Captive trajectory rig and wind tunnel.
         targets: Function of `problem.time` (s) that returns the target, shape (5, 1): expressions, or spline_targets.
         horizon: Final time, s.
         start_roll, start_rate: Roll (rad) and rate (rad/s) at time 0; free if None.
-        settings: Weights and limits; the defaults if None.
+        settings: Weights and limits.
         obstacles: Obstacles; None for none.
-
-    Returns:
-        The problem. Its guess is the roll of least cost on a grid of rolls and times, see least_cost_roll.
 
     Raises:
         ProblemError: The horizon is not positive; no roll reaches one of the targets; the start is outside the limits.
@@ -286,19 +278,12 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig over time with the least integral of a cost and of the weighted squared roll rate.
+    """Return the roll of the rig at equally spaced times t, (samples,), rad, with the least integral of cost and rate.
 
-    The roll is found by dynamic programming. Shape (samples,), rad.
-
-    Args:
-        cost: Function (indices of times, rolls), both of shape (n,), that returns finite costs of shape (n,).
-        t: Equally spaced times. Shape (samples,), s.
-        lower, upper: Limits of the roll, rad. If infinite, all rolls of a turn are searched, and the roll may wind.
-        first_roll: Roll at t[0]; None leaves it free, in the turn nearest to 0.
-        rate_weight: Weight of the squared rate.
-        acceleration_weight: Weight of the squared acceleration, which a grid of rolls does not resolve. It is replaced
-            by a weight of the rate with which a change of roll in its optimal time costs the same.
-        rate_limit: rad/s; the first grid may exceed it by one step.
+    Dynamic programming minimises the integral of `cost`, a function of (indices of times, rolls), both (n,), and of the
+    weighted squared rate. A grid of rolls does not resolve accelerations. Their weight is replaced by a weight of the
+    rate with which a change of roll in its optimal time costs the same. Without limits all rolls of a turn are
+    searched, and the roll may wind. The first grid may exceed the rate limit by one step.
     """
     count, about = len(t), float(np.clip(0.0, lower, upper)) if first_roll is None else first_roll
     step = FULL_TURN / SEARCH.rolls
@@ -340,7 +325,7 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the index of the roll at each time of the lowest-cost path through a grid of times and rolls, in which
+    """Return the index of the roll at each time on the lowest-cost path through a grid of times and rolls, in which
     rates beyond the limit are penalised.
     """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]

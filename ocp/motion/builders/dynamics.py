@@ -1,9 +1,12 @@
-"""Optimal control problems of fixed and free-floating arms within actuator limits, controlled by acceleration or jerk.
+"""Motions of fixed and free-floating arms within actuator limits, controlled by joint acceleration or jerk.
 
-The joint torques follow from inverse dynamics (see `torques`). No mass matrix is inverted, and torque limits are
-ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
+The joint torques follow from inverse dynamics,
 
-`ocp.motion.builders.dynamics_plan` declares problems with several goals, and with changing loads, as phases.
+    tau = M(q) q'' + h(q, q') - (external forces) + d q' + c tanh(q' / w),
+
+with viscous friction d and Coulomb friction c, smoothed below the speed w. A floating base conserves momentum: it moves
+as the joints make it move, and the torques are those of the joints alone. No mass matrix is inverted, and torque limits
+are ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 """
 
 from __future__ import annotations
@@ -16,38 +19,217 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models import Robot, find_wheels
+from models import FixedBase, FreeFloating, Machine, Robot, Standing, find_wheels
 from models.checks import NOT_NUMBERS, Array, floats
-from models.robot.dynamics import Wrench
+from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
 from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints
-from ocp.motion.builders.torques import (
-    JointFriction,
-    Motors,
-    checked_motors,
-    joint_torques,
-    limit_power,
+from ocp.motion.builders.standing.problem import (
+    FreeTime,
+    constrain_tips,
+    declare_horizon,
+    declare_joints,
     limit_torques,
-    running_cost,
 )
 from ocp.motion.tasks.checks import (
     check_length,
     check_rest,
     checked_configuration,
     checked_tasks,
+    checked_weights,
     clip_to_limits,
     rates_at_rest,
 )
-from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
+LENGTH_RATE = 1e-2
+"""Joint rate below which the integrand |q'| of the path length in a cost is smoothed, rad/s.
+
+sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 % at 0.5 rad/s, and by LENGTH_RATE at rest.
+"""
+
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+Motors = FixedBase | FreeFloating  # type of the machines whose motion the joint torques alone determine
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Viscous and smoothed Coulomb friction in the joints of a machine.
+
+    Attributes:
+        viscous: Viscous coefficient, one number or one for each joint, N m s/rad or N s/m.
+        coulomb: Coulomb friction, one number or one for each joint, N m or N.
+        slip: Speed at which the smoothed Coulomb friction reaches three quarters of its value, rad/s or m/s.
+
+    Raises:
+        ProblemError: A coefficient is negative, or `slip` is not positive.
+    """
+
+    viscous: Any = 0.0
+    coulomb: Any = 0.0
+    slip: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("viscous", "coulomb"):
+            require.array(f"friction: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+        if not require.nonnegative("friction: slip", self.slip) > 0:
+            raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
+
+    def torques(self, rates: Any) -> Any:
+        """Return the joint torques that overcome the friction at given joint rates. Shape (n, 1)."""
+        n = rates.numel()
+        viscous = ca.DM(require.broadcast("friction: viscous", self.viscous, n, "joints", sign="nonnegative"))
+        coulomb = ca.DM(require.broadcast("friction: coulomb", self.coulomb, n, "joints", sign="nonnegative"))
+        return viscous * rates + coulomb * ca.tanh(rates / self.slip)
+
+
+def joint_torques(
+    machine: Motors,
+    motion: tuple[Any, Any, Any, Any],
+    *,
+    friction: JointFriction | None = None,
+    wrenches: Sequence[Wrench] = (),
+    gravity: Any = None,
+) -> Any:
+    """Return the joint torques (forces of prismatic joints) that a motion requires. Shape (n, 1), N m or N.
+
+    Args:
+        machine: Machine on a fixed base, or floating freely.
+        motion: Base configuration, joint positions, rates and accelerations. Shapes (base_size, 1) and (n, 1).
+            Symbols for a floating machine, because they are differentiated.
+        friction: Friction in the joints; None for none.
+        wrenches: External wrenches, on a fixed base only.
+        gravity: Acceleration of free fall, m/s^2, on a fixed base only; GRAVITY if None.
+
+    Raises:
+        ProblemError: The machine is of another kind, or external forces act on a floating one.
+    """
+    robot = checked_motors("joint_torques", machine).robot
+    base, joints, rates, accelerations = motion
+    if isinstance(machine, FixedBase):
+        load: dict[str, Any] = {"wrenches": wrenches, "gravity": GRAVITY if gravity is None else gravity}
+        ground = machine.world_from_base(base)
+        torques = inverse_dynamics(robot, joints, rates, accelerations, **load, world_from_base=ground)
+    else:
+        if wrenches or gravity is not None:
+            words = "external wrenches and gravity need a fixed base: a free-floating machine conserves its momentum"
+            raise ProblemError(words, name="wrenches" if wrenches else "gravity", value=wrenches or gravity)
+        torques = machine.joint_torques(base, joints, rates, accelerations)
+    return torques if friction is None else torques + friction.torques(rates)
+
+
+def checked_motors(name: str, machine: Any) -> Motors:
+    """Return a machine if the joint torques alone determine its motion, else raise ProblemError."""
+    if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
+        words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
+        words += "standing_problem for a standing machine"
+        raise ProblemError(words, name="machine", value=machine)
+    return machine
+
+
+@dataclass(frozen=True, eq=False)
+class Actuation:
+    """Options of a motion controlled by joint accelerations, or by jerks if these are limited or weighted."""
+
+    cost: Cost | None = None  # weights of all terms but the time; None for half the squared rates
+    rests: tuple[bool, bool] = (False, False)  # whether the joints rest at the start and at the end
+    end_rows: Any = None  # rows (k, n) of the velocities that are zero at an end at rest; None for all
+    smoothing: float = 1e-3  # duration in which a control passes from limit to limit, as a share of the horizon
+
+
+def declare_actuators(
+    problem: Problem,
+    machine: Machine,
+    horizon: float,
+    place: tuple[Any, Any],
+    *,
+    bounds: JointBounds,
+    actuation: Actuation,
+    pace: Any,
+    suffix: str = "",
+) -> tuple[Any, Any, Any]:
+    """Declare joint velocities and accelerations within actuator limits; return both and the running cost per second.
+
+    The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
+    "power" where these are limited or weighted. `place` has base configuration and joint positions, `pace` is the
+    seconds of the motion in a second of the problem.
+    """
+    (base, joints), robot, n = place, machine.robot, machine.joint_size
+    cost = Cost() if actuation.cost is None else actuation.cost
+    smoothing, (initial, terminal) = actuation.smoothing * horizon, (0.0 if rest else None for rest in actuation.rests)
+    limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": robot.unit("/s")}
+    if terminal is None or actuation.end_rows is None:
+        rates = problem.state(f"velocities{suffix}", n, initial=initial, terminal=terminal, **limits)
+    else:
+        rates = problem.state(f"velocities{suffix}", n, initial=initial, **limits)
+        if len(actuation.end_rows):
+            problem.end(f"rest{suffix}", ca.mtimes(ca.DM(actuation.end_rows), rates), 0, 0, unit=robot.unit("/s")[0])
+    limits = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
+    jerks: Any = ca.DM(0, 1)
+    if np.isfinite(bounds.jerk).any() or cost.jerk:
+        second = problem.state(f"accelerations{suffix}", n, **limits)
+        jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
+        problem.dynamics(second, pace * jerks)
+        smooth = smoothing**2 * ca.sumsqr(jerks)
+    else:
+        second = problem.control(f"accelerations{suffix}", n, **limits)
+        smooth = ca.sumsqr(second)
+    problem.dynamics(rates, pace * second)
+    torques: Any = None
+    if np.isfinite([bounds.torque, bounds.power]).any() or weights_torques(cost):
+        torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
+        limit_torques(problem, robot, torques, bounds.torque, suffix=suffix)
+    running = running_cost(machine, cost, (base, joints, rates, second), jerks=jerks, torques=torques)
+    if torques is not None:
+        running += limit_power(problem, torques * rates, bounds, cost, suffix=suffix)
+    return rates, second, running + smoothing**2 / 2 * smooth
+
+
+def weights_torques(cost: Cost) -> bool:
+    """Return whether a cost depends on joint torques."""
+    return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
+
+
+def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
+    """Return the cost per second of a motion, without the terms of duration and positive power, as an expression."""
+    (base, joints, rates, second), n = motion, machine.joint_size
+    running = ca.dot(
+        ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
+    )
+    if cost.velocity:
+        running += ca.dot(ca.DM(cost.joint_weights(n)), rates**2) / 2
+    if cost.length:
+        running += cost.length * ca.sqrt(ca.dot(ca.DM(checked_weights(cost.weights, n)), rates**2) + LENGTH_RATE**2)
+    if cost.jerk:
+        running += cost.jerk * ca.sumsqr(jerks)
+    if cost.turning and isinstance(machine, FreeFloating):
+        spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
+        running += cost.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
+    if np.any(np.asarray(cost.effort)):
+        running += ca.dot(
+            ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
+        )
+    return running
+
+
+def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, *, suffix: str = "") -> Any:
+    """Declare the limits of the actuators' powers, W, and return the cost per second of the positive power.
+
+    If the cost weights energy, the positive power of each joint is a control of this name, because the cost needs it.
+    """
+    if not cost.energy:
+        if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():
+            problem.path(f"power{suffix}", powers[rows], upper=bounds.power[rows], unit="W")
+        return 0.0
+    power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
+    problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
+    return cost.energy * ca.sum1(power)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,20 +277,19 @@ def dynamics_problem(
     """Declare the optimal control problem of a motion within actuator limits that minimises effort, energy or time.
 
     The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
-    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted.
-    The path constraints are "torques", "power", and with tasks "tip": the time derivative of the
-    task velocities, with pose errors fed back. A start with free velocity must satisfy the task velocities.
+    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted. The
+    path constraints are "torques", "power", and with tasks "tip": the time derivative of the task velocities, with pose
+    errors fed back. A start with free velocity must satisfy the task velocities.
 
     Args:
         machine: A FixedBase, or a FreeFloating machine, whose momentum is conserved.
-        tasks: A TipTask, or several that are done at once over the whole motion, functions of the time in s. An empty
-            sequence for a motion from point to point.
+        tasks: A TipTask, several that are done at once over the whole motion, or none. Functions of the time in s.
         horizon: Final time, s, or FreeTime(...).
-        start, end: Start and end configurations. Shape (n,), rad or m; nan where free, None if all are free. A
-            start is free only in a phase that is joined to another.
+        start, end: Start and end configurations. Shape (n,), rad or m; nan where free, None if all are free. A start is
+            free only in a phase that is joined to another.
         limits: Limits of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         cost: Weights of the cost; the squared torques if None.
-        setup: Velocities and base at both ends, friction, loads, control and clearance; the defaults if None.
+        setup: Velocities and base at both ends, friction, loads, control and clearance.
 
     Raises:
         ProblemError: Sizes or options do not match; an end is outside the limits; the jerk is limited but not the
@@ -153,7 +334,11 @@ def dynamics_problem(
     if cost.energy or np.isfinite(bounds.power).any():
         running += limit_power(problem, torques * motion[2], bounds, cost)
     if equations is not None:
-        _declare_tasks(problem, equations, ends, motion, duration)
+        if not np.isnan(ends.first).any():
+            checked_tasks(equations, ends.base, ends.first, duration)
+        check_length(equations, ends.base, duration)
+        check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
+        constrain_tips(problem, equations, motion, (problem.time,), moving=not ends.rests[0])
     if setup.clearance_constraints is not None:
         base = "base" if machine.base_size else machine.base_home()
         setup.clearance_constraints.declare(problem, base, horizon=None if free else duration)
@@ -163,25 +348,16 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Boundary conditions of a motion, checked against the joint limits; free positions and velocities are nan.
+    """Boundary conditions of a motion, checked against the joint limits; free positions and velocities are nan."""
 
-    Attributes:
-        first, last: Joint positions at the start and at the end. Shape (n,).
-        first_rates, last_rates: Joint velocities there. Shape (n,).
-        rests: Whether all joints are at rest at the start, and at the end.
-        base: Configuration of the base at the start; its guess where it is free.
-        joined: Whether joints or base continue from another phase.
-        start: Joint positions at the start of the guess. Shape (n,).
-    """
-
-    first: Array
-    last: Array
+    first: Array  # joint positions at the start, (n,)
+    last: Array  # and at the end
     first_rates: Array
     last_rates: Array
-    rests: tuple[bool, bool]
-    base: Array
-    joined: bool
-    start: Array
+    rests: tuple[bool, bool]  # whether all joints are at rest at the start, and at the end
+    base: Array  # configuration of the base at the start; its guess where it is free
+    joined: bool  # whether joints or base continue from another phase
+    start: Array  # joint positions at the start of the guess, (n,)
 
     @classmethod
     def checked(
@@ -236,9 +412,7 @@ def _declare_motion(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return positions or velocities that a user gives for one end of a motion as numbers (n,), nan where free; raise
-    ProblemError if the size is wrong or a number infinite.
-    """
+    """Return positions or velocities given for one end as numbers (n,), nan where free, or raise ProblemError."""
     if value is None:
         return np.full(n, np.nan)
     with suppress(*NOT_NUMBERS):
@@ -249,9 +423,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scales for the solver of the angles, speeds, accelerations and jerks of reaction wheels, nan for other
-    joints. Shape (4, n).
-    """
+    """Return scales (4, n) of angles, speeds, accelerations and jerks of reaction wheels, nan for other joints."""
     # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():
@@ -288,22 +460,3 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
         rows = [row for row in rows if row < 3] + [3, 4, 5]
     if rows:
         problem.end("base", gaps[rows], 0.0, 0.0, unit="m, rad")
-
-
-def _declare_tasks(
-    problem: Problem, equations: TaskEquations, ends: _Ends, motion: tuple[Any, Any, Any, Any], duration: float
-) -> None:
-    """Constrain the tip accelerations to those that tasks prescribe; declare the pose errors that the audit checks."""
-    base, joints, rates, second = motion
-    if not np.isnan(ends.first).any():
-        checked_tasks(equations, ends.base, ends.first, duration)
-    check_length(equations, ends.base, duration)
-    check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
-    targets = equations.targets(problem.time)
-    if not ends.rests[0]:
-        residual = equations.residual(base, joints, rates, targets)
-        problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(base, joints, rates, second, progress=(problem.time,))
-    problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.deviations(base, joints, rates, targets).items():
-        problem.watch(name, **deviation)

@@ -1,15 +1,11 @@
-"""Planners of motions to one or several goals within actuator limits: they solve a problem and audit the plan.
+"""Motions to several goals within actuator limits, and the solver of plans that satisfy their limits between the nodes.
 
-A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
-plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
-between the nodes, it is tightened there (`ocp.tightening`). If that costs too much, the mesh is refined
-where the tightening is expensive: the excess of a smooth plan decreases with the square of the interval.
+A smooth plan of least effort needs few intervals. A plan of least time switches from limit to limit and gets nodes at
+its switches. Where a limit is still exceeded between the nodes, it is tightened there (`ocp.tightening`). If that costs
+too much, the mesh is refined there: the excess of a smooth plan decreases with the square of the interval.
 
-A motion to several goals may pick up and put down loads there. The motion to each goal is a phase with its own machine,
-declared by `dynamics_problem`. Joints and base are continuous between phases, so are the velocities if the machine does
-not stop there, and the accelerations if the jerk is the control. A load changes the machine and is picked
-up or put down at rest only: then the momentum is zero before and after. Grasping a moving load is an impact with a
-velocity jump; it needs a join of `Phases` declared by hand.
+The motion to each goal is a phase with its own machine. A load is picked up or put down at rest only: then the momentum
+is zero before and after. Grasping a moving load is an impact; it needs a join of `Phases` declared by hand.
 """
 
 from __future__ import annotations
@@ -18,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -29,12 +25,10 @@ from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, is_clearance, solve_with_clearance
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import DynamicsSetup, Motors, checked_motors, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.torques import Motors, checked_motors
 from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
@@ -62,22 +56,22 @@ def dynamics_phases(
         goals: At least one, each with joints and a duration; all have the joints of the machine.
         start: Start configuration. Shape (n,), rad or m.
         total: Duration of all phases together, s, if some have a free time; None leaves it free.
-        limits, cost, setup: Arguments of `dynamics_problem` for all phases. `start_velocity` and `start_base` apply
-            where the first one begins, `end_base` where the last one ends, and clearance in those phases whose machine
-            is that of the collision scene. The goals give their velocities themselves.
+        limits, cost, setup: Arguments of `dynamics_problem` for all phases. Velocity and base at the start and base at
+            the end are those of the whole motion, clearance applies where the machine is that of the collision scene,
+            and the goals give their velocities themselves.
 
     Raises:
         ProblemError: As `dynamics_problem`; there are no goals; one is a pose, or has no duration; their machines
             differ in the number of joints or in the kind of base; the machine changes while it moves or has momentum; a
-            phase with tasks starts at unknown joints; the phases cannot have this total duration; the setup has an
+            phase with tasks starts at unknown joints; the total duration is impossible; the setup has an
             `end_velocity`.
     """
     goals = checked_goals(goals)
     setup = DynamicsSetup() if setup is None else require.instance("dynamics_phases: setup", setup, DynamicsSetup)
-    _check_end_velocity(setup)
+    if setup.end_velocity != "rest":
+        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
+        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
     clearance = setup.clearance_constraints
-    if clearance is not None:
-        require.instance("dynamics_phases: clearance_constraints", clearance, ClearanceConstraints)
     names = phase_names(goals)
     machines, problems = machines_of(machine, goals), {}
     begin: Any = start
@@ -112,11 +106,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Return goals as a tuple after checking that one problem, with a phase for each goal, can reach them one by one.
-
-    Raises:
-        ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
-    """
+    """Return goals as a tuple; raise ProblemError unless one problem with a phase for each can reach them."""
     checked = tuple(require.each("goals", goals, Goal))
     if not checked:
         raise ProblemError("goals: at least one is needed", name="goals", value=goals)
@@ -192,11 +182,9 @@ class MeshSettings:
     """Settings of the search for a plan that satisfies its limits between the nodes of the mesh."""
 
     meshes: int = 3  # largest number of meshes, each finer than the one before
-    # number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth
-    splits: int = 3
+    splits: int = 3  # number of parts of an interval whose tightened limit costs too much
     excess: float = 1e-5  # largest excess of a limit between the nodes, in its own unit
-    # largest relative increase of the cost by tightened limits; above it, nodes at switches help more
-    cost_increase: float = 1e-3
+    cost_increase: float = 1e-3  # largest relative increase of the cost by tightened limits
 
 
 MESH_SETTINGS = MeshSettings()
@@ -204,20 +192,11 @@ MESH_SETTINGS = MeshSettings()
 
 @dataclass(frozen=True, eq=False)
 class SolveSettings:
-    """Settings of a solve that is audited and, if the audit fails, repeated on finer meshes.
+    """Settings of a solve that is audited and, if the audit fails, repeated on finer meshes."""
 
-    Attributes:
-        method: First mesh; None for that of the planner.
-        options: IPOPT options.
-        tolerances: Tolerances of the audit by name, see `ocp.audit.audit.audit`.
-
-    Raises:
-        ProblemError: The method is no collocation, or the options are no mapping.
-    """
-
-    method: Collocation | None = None
-    options: Mapping[str, Any] | None = None
-    tolerances: Mapping[str, float] | None = None
+    method: Collocation | None = None  # first mesh; None for that of the planner
+    options: Mapping[str, Any] | None = None  # of IPOPT
+    tolerances: Mapping[str, float] | None = None  # of the audit by name, see `ocp.audit.audit.audit`
 
     def __post_init__(self) -> None:
         if self.method is not None:
@@ -228,87 +207,6 @@ class SolveSettings:
     def ipopt_options(self) -> dict[str, Any]:
         """IPOPT options given by the user, completed by the defaults of the planner."""
         return {**IPOPT, **(self.options or {})}
-
-
-@interruptible
-def solve_dynamics(
-    machine: Motors,
-    tasks: TipTask | Goal | Sequence[TipTask] | Sequence[Goal],
-    horizon: float | FreeTime | None = None,
-    *,
-    start: Any,
-    limits: Limits | None = None,
-    cost: Cost | None = None,
-    setup: DynamicsSetup | None = None,
-    settings: SolveSettings | None = None,
-) -> Solution:
-    """Plan a motion within actuator limits, either along tip tasks or to one or several goals, and audit the plan.
-
-    The problem is `dynamics_problem`, or the phases of `dynamics_phases`. The plan satisfies its limits between the
-    nodes, too, to 1e-5 of their units. The first plan that passes its audit is returned. If none passes, the feasible
-    plan of least cost is returned; its optimality is then undetermined, or it costs too much, by about its
-    `tightening_cost`. Least time alone, `Cost(velocity=0, time=1)`, leaves the motion of joints that need not hurry
-    undetermined, so that the optimality is undetermined, too. Add a small weight of accelerations or torques.
-
-    Args:
-        machine, start, limits, cost, setup: As for `dynamics_problem`.
-        tasks: Tip tasks as for `dynamics_problem`; one goal, which has joints and perhaps tasks on the way; or the
-            goals of `dynamics_phases`, for which the solution has a phase each, `solution.phase(name)`. Goals give
-            their velocities themselves.
-        horizon: Final time, s, or FreeTime(...). For several goals, which have their own durations, that of all phases
-            together; None leaves it free.
-        settings: First mesh, solver options and audit tolerances. By default, 20 Legendre intervals of degree 5 with
-            nodes at the breaks of the tasks. Up to two more meshes are tried, each twice as fine, or refined where
-            needed.
-
-    Raises:
-        SolveError: No plan satisfies its limits. The message has the result of each attempt, and the joint, the time
-            and the limit that is violated.
-        ProblemError: As `dynamics_problem` and `dynamics_phases`.
-    """
-    own_setup = DynamicsSetup() if setup is None else require.instance("solve_dynamics: setup", setup, DynamicsSetup)
-    shared: dict[str, Any] = {"start": start, "limits": limits, "cost": cost}
-    clearance, total = own_setup.clearance_constraints, cast(Any, horizon)
-    if isinstance(tasks, Sequence) and isinstance(next(iter(tasks), None), Goal):
-        goals = checked_goals(tasks)
-        phases = zip(phase_names(goals), machines_of(machine, goals), strict=True)
-        limited_machines = {name: (own, limits) for name, own in phases}
-
-        def declare_phases(clearance: ClearanceConstraints | None) -> Problem:
-            own = replace(own_setup, clearance_constraints=clearance)
-            return dynamics_phases(machine, goals, total=total, setup=own, **shared)
-
-        return within_limits(declare_phases, clearance, limited_machines, settings=settings)
-    if isinstance(tasks, Goal):
-        _check_end_velocity(own_setup)
-        horizon = tasks.duration if horizon is None else horizon
-        (goal,) = checked_goals([replace(tasks, duration=horizon)])
-        end_base = own_setup.end_base if goal.base is None else goal.base
-        own_setup = replace(own_setup, end_velocity=goal.velocity, end_base=end_base)
-        (machine,), shared["end"] = machines_of(machine, [goal]), goal.joints
-    tip_tasks: Any = tasks.tasks if isinstance(tasks, Goal) else tasks
-
-    def declare(clearance: ClearanceConstraints | None) -> Problem:
-        own = replace(own_setup, clearance_constraints=clearance)
-        return dynamics_problem(machine, tip_tasks, duration, setup=own, **shared)
-
-    duration: float | FreeTime = horizon if isinstance(horizon, FreeTime) else require.positive("horizon", horizon)
-    at = () if isinstance(duration, FreeTime) else breaks_of(tip_tasks, duration)
-    return within_limits(declare, clearance, {"": (machine, limits)}, breaks=at, settings=settings)
-
-
-def _check_end_velocity(setup: DynamicsSetup) -> None:
-    """Raise ProblemError if the setup prescribes an end velocity, because every goal states its own velocity."""
-    if setup.end_velocity != "rest":
-        words = "end_velocity: every goal has its own; set Goal(velocity=...)"
-        raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
-
-
-def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
-    """Return the times at which tasks have kinks or jumps, as fractions of the horizon."""
-    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
-    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
-    return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:
@@ -329,14 +227,17 @@ def within_limits(
 ) -> Solution:
     """Solve a problem on finer and finer meshes until a plan passes its audit and satisfies its limits everywhere.
 
-    Limits are satisfied between the mesh nodes, too; see `solve_dynamics`.
+    The limits hold between the nodes, too, to 1e-5 of their units. If no plan passes, the feasible plan of least cost
+    is returned; its optimality is then undetermined, or it costs too much, by about its `tightening_cost`.
 
     Args:
         declare: Declares the problem under clearance constraints.
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
         breaks: Fractions of the horizon that get nodes.
-        settings: First mesh, solver options and audit tolerances.
-        guess: Guess of the first solve; that of the problem if None.
+        settings, guess: First mesh, solver options and audit tolerances; guess of the first solve.
+
+    Raises:
+        SolveError: No plan satisfies its limits; the message has the result of each attempt.
     """
     own = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     mesh = (own.method or POINTS).with_nodes_at(breaks)
@@ -369,9 +270,8 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Solve a problem on finer and finer meshes; return the first plan within its limits that passes its audit, or else
-    the feasible one of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a
-    plan.
+    """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
+    of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin

@@ -20,8 +20,9 @@ from models import FixedBase, Machine
 from models.checks import Array
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import ProblemError, SolverStatus, require
+from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.constant_jerk import path_solution
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
 from ocp.motion.local.inverse_kinematics import IkOptions, inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
@@ -32,8 +33,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-RATE_SLACK = 1e-9
-"""Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
+RATE_SLACK = 1e-9  # relative excess over a rate limit, at which a motion at constant speed may be all the time
 
 
 @remembers_request("joint motion")
@@ -51,16 +51,7 @@ def joint_motion_problem(
     """Declare the optimal control problem of least squared joint rates or least path length between two configurations.
 
     The state is "joints", the control "rates". With weights w and rates u the cost is the integral of sum(w u^2) / 2,
-    or the length in joint space, the integral of sqrt(sum(w u^2)).
-
-    Args:
-        machine: Machine on a fixed base.
-        horizon: Final time, s.
-        start, end: Configurations, rad or m. Shape (n,).
-        limits: Limits of joint positions and rates; the robot's own if None.
-        weights: Weights of the squared rates, shape (n,); all 1 if None.
-        length: Whether the length is the cost.
-        clearance_constraints: Collision avoidance; None for none.
+    or with `length` the length in joint space, the integral of sqrt(sum(w u^2)).
 
     Raises:
         ProblemError: Sizes do not match, or an end is outside the limits.
@@ -90,17 +81,10 @@ def joint_motion_problem(
 
 
 def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *, length: bool) -> Solution:
-    """Return the motion at constant speed along a joint path in the form of a solution of a `joint_motion_problem`.
+    """Return the motion at constant speed along a joint path (M, n) as a solution of a `joint_motion_problem`.
 
-    A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible.
-
-    Args:
-        problem: The problem.
-        path: Configurations with straight motions between them, the first and the last one those of the problem. Shape
-            (M, n).
-        scale: The length of a displacement is |scale * dq|, the roots of the weights. Shape (n,).
-        horizon: Final time, s.
-        length: Whether the length is the cost.
+    A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible. The
+    length of a displacement is |scale * dq|, with the roots (n,) of the weights.
     """
     changes = np.diff(path, axis=0)
     lengths = np.linalg.norm(changes * scale, axis=1)
@@ -111,41 +95,21 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     breaks = np.append(0.0, np.cumsum(shares))
     breaks[-1] = 1.0
     rates = np.diff(path, axis=0) / (np.diff(breaks)[:, None] * horizon)
-    ends, middle = np.array([0.0, 1.0]), np.array([0.5])
-    states = PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1))
-    controls, is_straight = PiecewisePolynomial(breaks, middle, rates[:, None]), len(rates) == 1
     # the costates of a motion without active constraints: minus the rate gradient of the running cost
     speeds = np.linalg.norm(rates * scale, axis=1, keepdims=True)
     duals = -(scale**2) * rates / (np.maximum(speeds, np.finfo(float).tiny) if length else 1.0)
-    costates = np.vstack([duals, duals[-1:]])
-    return Solution(
-        name=problem.name,
-        method={"type": "path at constant speed"},
-        solver="path",
-        success=is_straight,
-        status=SolverStatus.SOLVED if is_straight else SolverStatus.ACCEPTABLE,
-        message="" if is_straight else "it follows a path of straight motions, whose optimality no multipliers show",
-        cost=total if length else total**2 / (2 * horizon),
-        iterations=0,
-        horizon=horizon,
-        t=breaks * horizon,
-        states={"joints": path},
-        controls={"rates": np.vstack([rates, rates[-1:]])},
-        costates={"joints": costates},
-        parameters={},
-        cost_gradients={},
-        state_interpolant=states,
-        control_interpolant=controls,
-        costate_interpolant=PiecewisePolynomial(breaks, ends, np.stack([duals, duals], axis=1)),
-        variables=path.ravel(),
-        multipliers=np.zeros(0),
-        seconds={"build": 0.0, "solve": 0.0},
-        problem=problem,
+    ends = np.array([0.0, 1.0])
+    curves = (
+        PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1)),
+        PiecewisePolynomial(breaks, np.array([0.5]), rates[:, None]),
+        PiecewisePolynomial(breaks, ends, np.stack([duals, duals], axis=1)),
     )
+    message = "it follows a path of straight motions, whose optimality no multipliers show" if len(rates) > 1 else ""
+    cost = total if length else total**2 / (2 * horizon)
+    return path_solution(problem, "path at constant speed", curves, horizon=horizon, cost=cost, message=message)
 
 
-GUESS_STEPS = 64
-"""Number of time steps of the resolved-rate motion that is the initial guess; breaks of tasks add further steps."""
+GUESS_STEPS = 64  # number of time steps of the motion that is the initial guess, besides breaks of tasks
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,29 +156,24 @@ def minimum_velocity_problem(
     This is problem (27) of Kim and Kim 2011. The states are "joints", x2, and, on a floating base, "base"; the control
     is "rates". The path equality is "task", G x2' = v with the Jacobian G of the tasks, where v contains the drift of a
     machine with momentum and the feedback of a pose task. If tasks begin or end during the motion, the names end in the
-    number of the time interval between these events, see `ocp.motion.builders.tool_motion`.
+    number of the time interval between these events. The guess is a local motion.
 
     Args:
         machine, tasks: As for `plan`.
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration. Shape (joint_size,), rad or m. None leaves it free wherever the tips are at the
             beginning of their tasks. With a velocity task the tip is then where it is at `VelocitySetup.near`.
-        cyclic: Whether the joints end where they started, after a closed task. The closure that already follows from
-            the task is not required twice: the task may deviate by a constant velocity of the size of the
-            discretisation error, the state "closure", so that the joints close exactly. A floating base closes only if
-            the task requires it.
+        cyclic: Whether the joints end where they started, after a closed task, which may deviate by a constant velocity
+            of the size of the discretisation error, the state "closure". A floating base closes only if the task
+            requires it.
         weights: Weights of the squared joint rates, positive. Shape (joint_size,); all 1 if None.
         limits: Limits of joint positions and rates; the robot's own if None.
-        setup: Base at the start, guess and clearance; the defaults if None.
-
-    Returns:
-        The problem with its guess. Only the local motion is solved.
+        setup: Base at the start, guess and clearance.
 
     Raises:
         ProblemError: Rows are out of range, repeated, more than the joints, moved by no joint, or dependent everywhere;
             sizes are wrong; the start is outside the limits or off the task's pose; a cyclic task is not closed; the
-            horizon or the damping is not positive.
-        Unreachable: A free start was not found (a ProblemError).
+            horizon or the damping is not positive. Unreachable, a ProblemError, if a free start is not found.
     """
     setup = VelocitySetup() if setup is None else require.instance("setup", setup, VelocitySetup)
     require.flag("cyclic", cyclic)

@@ -44,60 +44,41 @@ from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, integrate_j
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-Columns = Callable[[Array], Array]
-"""Type of a function that returns C quantities of a path, shape (M, C), at times (M,) of the reference motion."""
+Columns = Callable[[Array], Array]  # function that returns C path quantities (M, C) at times (M,) of the reference
 
 
 @dataclass(frozen=True)
-class TableSettings:
-    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem."""
+class TimingSettings:
+    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem and its refinement."""
 
     degree: int = 7  # degree of the polynomials of a table
     accuracy: float = 1e-8  # largest error of a tabulated quantity, relative to its largest value
     smallest_cell: float = 1e-9  # width of an interval that is not halved further, relative to the whole
-    halvings: int = 40  # largest number of halvings of an interval
-    # points of an interval at which ratios to limits are evaluated, ten for each collocation point and node
-    points: int = 40
+    points: int = 40  # points of an interval at which ratios to limits are evaluated
     beside_jump: float = 1e-6  # distance of nodes from a jump of the path's derivatives, relative to the whole time
     same_node: float = 1e-7  # distance of nodes that count as one, relative to the whole time
-
-
-TABLES = TableSettings()
-IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
-
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Settings of the mesh refinement in `solve_minimum_time`."""
-
     demand: float = 2e-4  # largest accepted relative excess of a limit in an interval
-    # largest accepted error of integration in an interval, relative to its distance and to the top speed
-    defect: float = 1e-6
+    defect: float = 1e-6  # largest error of integration in an interval, per distance and top speed
     parts: int = 8  # largest number of parts of an interval in one refinement
 
 
-REFINEMENT = RefinementSettings()
+TIMING = TimingSettings()
+IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 
 @dataclass(frozen=True, eq=False)
 class TimingProblem:
     """Minimum-time problem along a path, its mesh, and the reference motion whose time is the path parameter.
 
-    Attributes:
-        problem: Problem with states "speed" and "acceleration" and control "jerk" in `units`. Its time is theta less
-            the start of the span, and its cost the time, s.
-        mesh: Nodes as fractions of the horizon, among them the jumps of the path's derivatives and of the reference's
-            jerk.
-        units: Largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3.
-        reference: Motion whose time is theta.
-        span: First and last theta of the problem, s. Before and after, the jerk is constant.
+    The states are "speed" and "acceleration", the control is "jerk", in `units`. The time of the problem is theta less
+    the start of the span, and its cost the time, s.
     """
 
     problem: Problem
-    mesh: tuple[float, ...]
-    units: tuple[float, float, float]
-    reference: SpeedProfile
-    span: tuple[float, float]
+    mesh: tuple[float, ...]  # nodes as fractions of the horizon, at jumps of derivatives of path and reference
+    units: tuple[float, float, float]  # largest speed, acceleration and jerk of the reference, m/s, m/s^2, m/s^3
+    reference: SpeedProfile  # motion whose time is theta
+    span: tuple[float, float]  # first and last theta of the problem, s; before and after, the jerk is constant
 
     @property
     def method(self) -> Collocation:
@@ -105,11 +86,7 @@ class TimingProblem:
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
-        """Return the speed profile of a solution, with constant jerk in each interval.
-
-        Raises:
-            ProblemError: The jerk of the solution is not constant in its intervals.
-        """
+        """Return the speed profile of a solution, with constant jerk in each interval."""
         curve = solution.control_interpolant
         if curve.values.shape[1] != 1:
             message = "the jerk of this solution is not constant in its intervals; solve with control='held'"
@@ -136,19 +113,12 @@ class TimingProblem:
 
 @dataclass(frozen=True, eq=False)
 class FastestMotion:
-    """Fastest motion along a path, with its minimum-time problem and solution.
+    """Fastest motion along a path, with its minimum-time problem and solution."""
 
-    Attributes:
-        schedule: Motion as from ocp.motion.schedule, without a list of dips.
-        solution: Solution on the last mesh.
-        timing: Problem with that mesh.
-        demand: Largest ratio of a limited quantity to its limit, on a grid ten times finer.
-    """
-
-    schedule: Schedule
-    solution: Solution
-    timing: TimingProblem
-    demand: float
+    schedule: Schedule  # motion as from ocp.motion.schedule, without a list of dips
+    solution: Solution  # on the last mesh
+    timing: TimingProblem  # problem with that mesh
+    demand: float  # largest ratio of a limited quantity to its limit, on a grid ten times finer
 
     @property
     def duration(self) -> float:
@@ -178,11 +148,9 @@ def solve_minimum_time(
         guess: Schedule of the same path to start from; planned here if None.
         intervals: Least number of intervals, besides nodes at the path's joins and the guess's changes of jerk.
         rounds: Largest number of mesh refinements where a limit is exceeded between the points.
-        options: IPOPT options.
 
     Raises:
-        ProblemError: As `minimum_time_problem`.
-        SolveError: The solver failed; names the worst residuals.
+        ProblemError, SolveError: As `minimum_time_problem`; or the solver failed, with the worst residuals.
     """
     require.count("rounds", rounds, 0)
     options = require.mapping("options", options)
@@ -214,10 +182,7 @@ def minimum_time_problem(
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
-    at rest" and "end at rest", "start jerk" and "end jerk".
-
-    Args:
-        path, limits, joints, guess, intervals: As for `solve_minimum_time`.
+    at rest" and "end at rest", "start jerk" and "end jerk". The arguments are those of `solve_minimum_time`.
 
     Raises:
         ProblemError: Joint limits are given without joints; limits of tool or torque are given; the joint jerk is
@@ -236,7 +201,7 @@ def minimum_time_problem(
         message = f"the guess is for a path of {guess.path.length:g} m, but this path has {path.length:g} m"
         raise ProblemError(message, name="guess", value=guess.path.length, limit=path.length)
     path_columns(path, limits, limited, path.sample_distances())  # raises if anything is not finite
-    reference = reference_motion(path, limits, limited) if guess is None else guess.profile
+    reference = schedule(path, limits, joints=limited).profile if guess is None else guess.profile
     if guess is not None and limited is not None:
         check_smooth(path, limits, limited)  # raises, like a schedule, if no motion satisfies the limits
     whole = reference.duration
@@ -266,9 +231,7 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units; `along` is the
-    function of theta that returns the reference speed and the values of `path_columns`.
-    """
+    """Declare the minimum-time problem over theta in scaled units; `along` gives `path_columns` and their speed."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -339,10 +302,10 @@ def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
     error = np.maximum(
-        (demand - 1) / REFINEMENT.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / REFINEMENT.defect
+        (demand - 1) / TIMING.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / TIMING.defect
     )[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
-    return np.where(error > 1, np.minimum(parts, REFINEMENT.parts), 1)
+    return np.where(error > 1, np.minimum(parts, TIMING.parts), 1)
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
@@ -360,24 +323,20 @@ def table(columns: Columns, breaks: Array) -> Any:
 
     Intervals between `breaks` are halved as far as necessary. At a break the interval that begins there applies.
     """
-    angles = np.pi * (np.arange(TABLES.degree + 1) + 0.5) / (TABLES.degree + 1)
+    angles = np.pi * (np.arange(TIMING.degree + 1) + 0.5) / (TIMING.degree + 1)
     nodes = (1 - np.cos(angles)) / 2  # inside the interval, off the breaks
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
-    finished: list[tuple[Array, Array]] = []
-    scale: Array | None = None
-    for number in range(TABLES.halvings):
-        if not start.size:
-            break
+    finished, scale = list[tuple[Array, Array]](), None
+    while start.size:
         places = np.concatenate([nodes, between])
         values = columns((start[:, None] + width[:, None] * places).ravel()).reshape(len(start), len(places), -1)
-        if scale is None:
-            scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300)
+        scale = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-300) if scale is None else scale
         coefficients = np.einsum("ij,cjm->cim", fit, values[:, : len(nodes)])
         error = np.abs(np.einsum("ij,cjm->cim", _bernstein(between), coefficients) - values[:, len(nodes) :])
-        fine = (error <= TABLES.accuracy * scale).all(axis=(1, 2)) | (number == TABLES.halvings - 1)
-        fine |= width < TABLES.smallest_cell * (breaks[-1] - breaks[0])
+        fine = (error <= TIMING.accuracy * scale).all(axis=(1, 2))
+        fine |= width < TIMING.smallest_cell * (breaks[-1] - breaks[0])
         finished.append((start[fine], coefficients[fine]))
         half = width[~fine] / 2
         start = np.stack([start[~fine], start[~fine] + half], axis=1).ravel()
@@ -386,12 +345,12 @@ def table(columns: Columns, breaks: Array) -> Any:
     order = np.argsort(starts)
     cells = cells[order]
     # a constant polynomial behind the end, which belongs to no other interval
-    cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TABLES.degree + 1, axis=1)])
+    cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TIMING.degree + 1, axis=1)])
     ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
-    knots = np.repeat(ends, TABLES.degree + 1).tolist()
+    knots = np.repeat(ends, TIMING.degree + 1).tolist()
     flat = cells.reshape(-1, cells.shape[2])
     time = ca.MX.sym("time")
-    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TABLES.degree], flat.shape[1], {"lookup_mode": ["binary"]})
+    value = ca.bspline(time, ca.DM(flat.ravel()), [knots], [TIMING.degree], flat.shape[1], {"lookup_mode": ["binary"]})
     return ca.Function("along", [time], [value])
 
 
@@ -401,12 +360,9 @@ def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature, and first three derivatives of the joint positions at distances (M,) along a path.
+    """Return speed limit, curvature and three derivatives of the joints at distances (M,). Shape (M, C).
 
-    The curvature is zero if the centripetal acceleration is not limited. Shape (M, C).
-
-    Raises:
-        ProblemError: A curvature or a joint is not finite, or the joints have a wrong shape.
+    The curvature is zero if the centripetal acceleration is not limited.
     """
     limited = np.isfinite(limits.centripetal)
     columns = [speed_limit(path, limits, s), curvature_along(path, s) if limited else np.zeros(len(s))]
@@ -417,10 +373,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of a limited quantity to its limit at each sample of a motion along a path. Shape (M,).
-
-    Torques are not among the quantities. Where the path's derivatives jump, the values after the jump count.
-    """
+    """Return the largest ratio of a limited quantity but a torque to its limit at M samples. Shape (M,)."""
     usage = np.abs(limit_rows(path, limits, joints, motion.distance, torques=False).usage(motion))
     usage[:, 0] **= 2  # the speed at the centripetal limit, of which the acceleration is the square
     return np.asarray(np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1)))
@@ -428,35 +381,19 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
     """Return the largest ratio of a limited quantity to its limit in each interval of a speed profile. Shape (K,)."""
-    inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
+    inside = (np.arange(TIMING.points) + 0.5) / TIMING.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     distance = np.clip(motion.distance, 0.0, path.length)
     demand = largest_demand(path, limits, joints, motion._replace(distance=distance))
-    return np.asarray(demand.reshape(-1, TABLES.points).max(axis=1))
+    return np.asarray(demand.reshape(-1, TIMING.points).max(axis=1))
 
 
 def _bernstein(x: Array) -> Array:
-    """Return the Bernstein polynomials of degree `TABLES.degree` at points x. Shape (len(x), degree + 1)."""
+    """Return the Bernstein polynomials of degree `TIMING.degree` at points x. Shape (len(x), degree + 1)."""
     return np.stack(
-        [comb(TABLES.degree, i) * x**i * (1 - x) ** (TABLES.degree - i) for i in range(TABLES.degree + 1)], axis=1
+        [comb(TIMING.degree, i) * x**i * (1 - x) ** (TIMING.degree - i) for i in range(TIMING.degree + 1)], axis=1
     )
-
-
-def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return a speed profile within all limits along a path, from `schedule` or, if that fails, a slower profile."""
-    try:
-        return schedule(path, limits, joints=joints).profile
-    except ProblemError:
-        check_smooth(path, limits, joints)  # raises if no motion satisfies the limits
-    quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
-    # slowed down by a factor: velocities shrink with it, accelerations with its square, jerks with its cube
-    motion = quick.at(quick.duration * np.linspace(0, 1, 2001))
-    rows = limit_rows(path, limits, joints, motion.distance, torques=False)
-    ends = np.cumsum([kind.shape[1] for kind in rows])[:-1]
-    kinds = np.split(np.abs(rows.usage(motion)), ends, axis=1)
-    c = 1.05 * max(float(kind.max(initial=1.0)) ** (1 / (order + 1)) for order, kind in enumerate(kinds))
-    return SpeedProfile(quick.t * c, quick.distance, quick.speed / c, quick.acceleration / c**2, quick.jerk / c**3)
 
 
 def distinct(values: Array, tolerance: float) -> Array:
@@ -470,22 +407,19 @@ def distinct(values: Array, tolerance: float) -> Array:
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
     """Return the mesh nodes of the minimum-time problem as fractions of its horizon.
 
-    Args:
-        reference: Reference motion; the changes of its jerk become nodes.
-        joins: Times at which the path's derivatives jump; nodes are placed on both sides. Shape (B,), s.
-        span: Start and end of the problem in the time of the reference motion, s.
-        intervals: Least number of intervals over the whole time.
+    Nodes are at the changes of jerk of the reference motion, and on both sides of the joins (B,), s, at which the
+    path's derivatives jump. The whole time has at least the given number of intervals.
     """
     whole, (begin, end) = reference.duration, span
-    beside = TABLES.beside_jump * whole
+    beside = TIMING.beside_jump * whole
     joins = joins[(joins > begin + 2 * beside) & (joins < end - 2 * beside)]
     sides = np.concatenate([joins - beside, joins + beside])
     changes = reference.t[
-        (reference.t > begin + TABLES.same_node * whole) & (reference.t < end - TABLES.same_node * whole)
+        (reference.t > begin + TIMING.same_node * whole) & (reference.t < end - TIMING.same_node * whole)
     ]
     if sides.size:
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * beside]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TABLES.same_node * whole)
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TIMING.same_node * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
     mesh = subdivide(nodes, parts)
     fractions = (mesh - begin) / (end - begin)

@@ -22,14 +22,14 @@ from models.checks import Array
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.torques import Actuation, declare_actuators
+from ocp.motion.builders.dynamics import Actuation, declare_actuators
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.tasks.checks import check_closed, check_speed
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.targets import required_nodes
-from ocp.motion.tasks.tip_task import TipTask, is_holonomic
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -46,12 +46,10 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 class FeedbackSettings:
     """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost."""
 
-    # largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh
-    decay: float = 4.0
+    decay: float = 4.0  # largest decay of a pose error over a mesh interval, as a power of e
     intervals: int = 8  # least number of intervals of the mesh in a stretch
     closed_gap: float = 1e-6  # pose error at the beginning of a task below which there is no gap to close, m and rad
-    # velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s
-    relaxation: float = 1e-5
+    relaxation: float = 1e-5  # velocity error of a relaxed task, m/s or rad/s, that costs as much as 1 rad/s
 
 
 FEEDBACK = FeedbackSettings()
@@ -59,26 +57,16 @@ FEEDBACK = FeedbackSettings()
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Interval of the horizon in which the same tasks are active.
+    """Interval of the horizon in which the same tasks are active."""
 
-    Attributes:
-        begin, end: Start and end time, s.
-        tasks: Indices of the active tasks.
-        equations: Their equations; None if there are none and the machine is free.
-        new: Whether each of these tasks begins here. Shape (len(tasks),).
-        breaks: Times between begin and end at which the tasks are less smooth. Shape (k,), s.
-        nodes: Those of them at which a mesh needs nodes so that joint rates can do the tasks. Shape (j,), s.
-        suffix: Suffix of the names of its states and controls.
-    """
-
-    begin: float
-    end: float
-    tasks: tuple[int, ...]
-    equations: TaskEquations | None
-    new: tuple[bool, ...]
-    breaks: Array
-    nodes: Array
-    suffix: str
+    begin: float  # s
+    end: float  # s
+    tasks: tuple[int, ...]  # indices of the active tasks
+    equations: TaskEquations | None  # of these tasks; None if there are none and the machine is free
+    new: tuple[bool, ...]  # whether each of these tasks begins here
+    breaks: Array  # times between begin and end at which the tasks are less smooth, (k,), s
+    nodes: Array  # those of them at which a mesh needs nodes so that joint rates can do the tasks, (j,), s
+    suffix: str  # of the names of its states and controls
 
     @property
     def duration(self) -> float:
@@ -88,19 +76,12 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active.
+    """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active."""
 
-    Attributes:
-        problem: Problem with states "joints" and, on a floating base, "base", and controls "rates", with suffixes.
-        stretches: Consecutive stretches.
-        horizon: Horizon of the motion and of the problem, s.
-        breaks: Fractions 0..1 of the horizon at which a mesh should have nodes. Shape (k,).
-    """
-
-    problem: Problem
+    problem: Problem  # with states "joints" and, on a floating base, "base", and controls "rates", with suffixes
     stretches: tuple[Stretch, ...]
-    horizon: float
-    breaks: Array
+    horizon: float  # of the motion and of the problem, s
+    breaks: Array  # fractions of the horizon at which a mesh should have nodes, (k,)
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
         """Return initial guesses of states and controls, by name, from the resolved-rate motion with index `number`."""
@@ -158,36 +139,25 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
 class ToolMotionSetup:
     """Boundary conditions, cost, limits and formulation of `tool_motion_problem`.
 
-    Attributes:
-        base: Configuration of the base at the start. Shape (base_size,).
-        start: Start configuration, rad or m. Where it is nan, or None, the start is free, and the tips must be where
-            their tasks begin. Shape (joint_size,).
-        reference: Configuration that satisfies the tasks at the start. A cyclic task is checked there, and with a free
-            start a velocity task starts with the tip there. Shape (joint_size,).
-        cyclic: Whether the joints end where they start.
-        weights: Weights of the squared joint rates. Shape (joint_size,).
-        bounds: Limits of joint positions and rates.
-        time_cost: Cost per second if the tasks may be executed more slowly. The horizon of the problem is then the
-            tasks' own, with the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints,
-            and PACE, that of the time, at least 1. None keeps the tasks' own time.
-        actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
-            None for rates as the control. The states "velocities" replace the rates, the tasks are constrained by their
-            accelerations, and velocities are continuous between stretches.
-        relaxed: Whether tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
-            constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the
-            tasks within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the
-            tasks' own time and without actuator limits.
-        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+    With a `time_cost` the tasks may be executed more slowly. The horizon of the problem is then the tasks' own, with
+    the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints, and PACE, that of the
+    time, at least 1. With `actuation` the states "velocities" replace the rates, and the tasks are constrained by their
+    accelerations.
+
+    `relaxed` tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
+    constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the tasks
+    within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the tasks' own time and
+    without actuator limits.
     """
 
-    base: Array
-    start: Array | None
-    reference: Array
-    cyclic: bool
-    weights: Array
-    bounds: JointBounds
-    time_cost: float | None = None
-    actuation: Actuation | None = None
+    base: Array  # configuration of the base at the start, (base_size,)
+    start: Array | None  # configuration, nan or None where free if the tips are where their tasks begin, (joint_size,)
+    reference: Array  # configuration that satisfies the tasks at the start, (joint_size,)
+    cyclic: bool  # whether the joints end where they start
+    weights: Array  # of the squared joint rates, (joint_size,)
+    bounds: JointBounds  # limits of joint positions and rates
+    time_cost: float | None = None  # per second; None keeps the tasks' own time
+    actuation: Actuation | None = None  # options of accelerations (jerks) as the control; None for rates as the control
     relaxed: bool = False
     clearance_constraints: ClearanceConstraints | None = None
 
@@ -199,11 +169,6 @@ class ToolMotionSetup:
 
 def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
     """Declare the optimal control problem of performing tasks with the least integral of weighted squared joint rates.
-
-    Args:
-        machine: Machine on a fixed or floating base.
-        stretches: Stretches of the horizon, see `stretches_of`.
-        setup: Boundary conditions, cost, limits and formulation.
 
     Raises:
         ProblemError: A cyclic motion has a task that is not closed, or several stretches with a task in the last; a
@@ -328,7 +293,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
             derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.setup.free
         _declare_tasks(motion, stretch, (place, joints, rates), pace, slack + error, free, required, derivatives)
-        placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
+        placed = np.concatenate([part.is_holonomic for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
         problem.dynamics(place, pace * machine.base_rate(place, joints, rates))
@@ -443,7 +408,7 @@ def _declare_tasks(
             change_at = ca.Function("change", [time], [ca.jtimes(targets_at(time), time, 1)])
             at.append(targets)
             along.append(problem.signal(f"target rates{suffix}", lambda t: change_at(stretch.begin + pace * t)))
-        gains = np.repeat([float(part.task.gain) for part in equations.bound], [p.task.size for p in equations.bound])
+        gains = equations.by_row(lambda task: float(task.gain))
         gap = ca.jtimes(residual, ca.vertcat(*at), ca.vertcat(*along)) + ca.DM(gains) * (residual - closure)
         problem.path(f"task{suffix}", ca.cse(gap), lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
         actuation = motion.setup.actuation
@@ -475,8 +440,8 @@ def _declare_tasks(
 
 
 def _pose_jacobian(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the Jacobian of task poses with respect to base and joint positions at a random configuration, at which
-    its rank is that of almost all configurations. Shape (size, base_size + joint_size).
+    """Return the Jacobian (size, base_size + joint_size) of task poses at a random configuration, at which its rank is
+    that of almost all configurations.
     """
     equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))

@@ -130,9 +130,7 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add the task `rows` q'' = `target`, which changes the joint accelerations q'' as little as possible in the
-        null space of all tasks added before.
-        """
+        """Add the task `rows` q'' = `target`, with the least change of q'' in the null space of all tasks before."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
@@ -169,14 +167,11 @@ def accelerations(
     """Return the joint accelerations that a redundancy resolution law commands. Shape (n, 1).
 
     Args:
-        machine: The machine.
-        equations: Equations of the tasks.
-        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together,
-            equation (20). ``null_space``: the zero moment point in the null space of the tasks, (21)-(22).
-            ``stabilised``: like augmented, with the centre of mass commanded in their null space.
+        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, equation (20).
+            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
+            augmented, with the centre of mass commanded in their null space.
         state: Time, joint positions and joint velocities, symbols of one kind.
         external: External wrenches as a function of time and tip position.
-        options: Target of the zero moment point, layers, gains and damping; `AccelerationOptions()` if None.
     """
     (time, q, qd), own = state, options or AccelerationOptions()
     directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
@@ -212,8 +207,7 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return the matrix and the right side of linear equations for the joint accelerations that keep a machine upright,
-    see `Stabiliser`.
+    """Return matrix and right side of equations for the accelerations that keep a machine upright, see `Stabiliser`.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -231,22 +225,16 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
     return ca.mtimes(directions, rows), ca.mtimes(directions, target)
 
 
-TIP_TOLERANCE = 1e-3
-"""Largest pose error up to which a motion counts as successful, m and rad."""
-STEPS_PER_CALL = 50
-"""Number of integration steps between two checks whether the motion fails."""
+TIP_TOLERANCE = 1e-3  # largest pose error up to which a motion counts as successful, m and rad
+STEPS_PER_CALL = 50  # number of integration steps between two checks whether the motion fails
 
 
 @dataclass(frozen=True)
 class Stop:
     """Reason why a simulated motion ends before its horizon, and the time at which it ends.
 
-    Attributes:
-        reason: ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed
-            limit. ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external`
-            is not a number.
-        time: Time of the stop, s.
-        message: The reason in words, with the numbers.
+    ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed limit.
+    ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external` is not a number.
     """
 
     reason: Literal["lift_off", "divergence", "breakdown"]
@@ -256,20 +244,12 @@ class Stop:
 
 @dataclass(frozen=True)
 class AccelerationSolution:
-    """Motion that results from an acceleration-level control law.
-
-    Attributes:
-        law: The law.
-        motion: Positions, velocities, accelerations and forces at every step up to the end or the stop; the sample of
-            the stop is the last one if it is finite.
-        tip_error: Norm of the pose errors in the rows of the tasks, m and rad; zero for velocities. Shape (M,).
-        stopped: Why the motion ends before the horizon; None if it does not.
-    """
+    """Motion that results from an acceleration-level control law."""
 
     law: Law
-    motion: StandingMotion
-    tip_error: Array
-    stopped: Stop | None
+    motion: StandingMotion  # at every step up to the end or the stop, whose sample is the last one if it is finite
+    tip_error: Array  # norm of the pose errors in the rows of the tasks, m and rad; zero for velocities, (M,)
+    stopped: Stop | None  # why the motion ends before the horizon; None if it does not
 
     @property
     def failures(self) -> tuple[str, ...]:
@@ -317,14 +297,11 @@ def resolve_accelerations(
     """Simulate a standing machine under a resolved-acceleration law up to the horizon, or until the motion fails.
 
     Args:
-        machine: A Standing machine.
         tasks: A TipTask, or several that are done at once.
-        horizon: Final time, s.
+        horizon, step: Final time, and step of the integration and between samples, s.
         start: Start configuration, shape (n,), rad or m, or a `Start` with the joints and their velocities.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
         external: External wrenches as a function of time and tip position.
-        step: Step of the integration and between samples, s.
-        options: Options of the law and of the simulation; `AccelerationOptions()` if None.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.
@@ -364,55 +341,47 @@ def resolve_accelerations(
     one_step = ca.Function("step", [state, time], [rk4_step(rate, state, width)])
     advance = cache(lambda count: one_step.mapaccum("steps", count))
     outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
-    recorder = _Recorder(outputs, function, own.stop_at_lift_off, own.speed_limit)
-    values, done = np.concatenate([joints, velocities]), 0
-    stopped = recorder.add(np.zeros(1), values[None, :])
+    states, done = np.concatenate([joints, velocities])[None, :], 0
+    first, stopped = _samples(outputs, function, np.zeros(1), states, own)
+    records = [first]
     while done < steps and stopped is None:
         count = min(STEPS_PER_CALL, steps - done)
-        states = np.array(advance(count)(values, (done * width + width * np.arange(count))[None, :])).T
-        stopped = recorder.add(np.asarray((done + np.arange(1, count + 1)) * width), states)
-        values, done = states[-1], done + count
-    return AccelerationSolution(law, *recorder.results(), stopped)
+        states = np.array(advance(count)(states[-1], (done * width + width * np.arange(count))[None, :])).T
+        times = np.asarray((done + np.arange(1, count + 1)) * width)
+        record, stopped = _samples(outputs, function, times, states, own)
+        records.append(record)
+        done += count
+    whole = {name: np.concatenate([record[name] for record in records]) for name in first}
+    gap = whole.pop("gap")
+    return AccelerationSolution(law, StandingMotion(**whole), gap, stopped)
 
 
-class _Recorder:
-    """Recorder of the samples of a simulated motion until a sample fails: lift-off, too fast, or not finite."""
-
-    def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
-        self._motion, self._law = motion, law
-        self._stop_at_lift_off, self._speed_limit = stop_at_lift_off, speed_limit
-        self._records: list[dict[str, Array]] = []
-
-    def add(self, times: Array, states: Array) -> Stop | None:
-        """Record samples of the motion up to the first one that fails; return why it fails, None if none fails."""
-        n = states.shape[1] // 2
-        q, qd = states[:, :n], states[:, n:]
-        qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
-        outputs = evaluate_motion(self._motion, times, q, qd, qdd=qdd)
-        not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
-        vertical = outputs["ground_force"][:, 2]
-        speed = np.abs(qd).max(axis=1)
-        too_fast = speed > self._speed_limit
-        lifted = (vertical <= 0) & self._stop_at_lift_off
-        bad = not_finite | too_fast | lifted
-        end = int(bad.argmax()) if bad.any() else len(times)
-        count = end + 1 if bad.any() and not not_finite[end] else end  # a finite failing sample is recorded too
-        motion = {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
-        self._records.append({name: value[:count] for name, value in {**motion, **outputs}.items()})
-        if end == len(times):
-            return None
-        at = float(times[end])
-        if not_finite[end]:
-            words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
-            return Stop("breakdown", at, words)
-        if lifted[end]:
-            words = f"lifts off at {at:.4g} s: the vertical ground force falls to {vertical[end]:.4g} N"
-            return Stop("lift_off", at, words)
-        words = f"diverges at {at:.4g} s: a joint reaches {speed[end]:.4g} rad/s (or m/s), above {self._speed_limit:g}"
-        return Stop("divergence", at, words)
-
-    def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion, and the norm of the pose errors of its tips at each sample. Shape (M,)."""
-        joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
-        gap = joined.pop("gap")
-        return StandingMotion(**joined), gap
+def _samples(
+    motion: Any, law: Any, times: Array, states: Array, options: AccelerationOptions
+) -> tuple[dict[str, Array], Stop | None]:
+    """Return samples of a motion by name up to the first one that fails, and why it fails: lift-off, too fast, or not
+    finite. A finite sample that fails is among them; "gap" is the norm of the pose errors of the tips.
+    """
+    q, qd = np.split(states, 2, axis=1)
+    qdd, gap = (np.array(part).T for part in law.map(len(times))(times[None, :], q.T, qd.T))
+    outputs = evaluate_motion(motion, times, q, qd, qdd=qdd)
+    not_finite = ~np.isfinite(np.hstack([states, qdd, outputs["ground_force"]])).all(axis=1)
+    vertical, speed = outputs["ground_force"][:, 2], np.abs(qd).max(axis=1)
+    lifted = (vertical <= 0) & options.stop_at_lift_off
+    bad = not_finite | (speed > options.speed_limit) | lifted
+    end = int(bad.argmax()) if bad.any() else len(times)
+    outputs |= {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
+    count = end + int(bad.any() and not not_finite[end])
+    record = {name: value[:count] for name, value in outputs.items()}
+    if end == len(times):
+        return record, None
+    at = float(times[end])
+    if not_finite[end]:
+        words = f"breaks down at {at:.4g} s: accelerations that do the tasks, or forces, are not finite"
+        return record, Stop("breakdown", at, words)
+    if lifted[end]:
+        words = f"lifts off at {at:.4g} s: the vertical ground force falls to {vertical[end]:.4g} N"
+        return record, Stop("lift_off", at, words)
+    limit = options.speed_limit
+    words = f"diverges at {at:.4g} s: a joint reaches {speed[end]:.4g} rad/s (or m/s), above {limit:g}"
+    return record, Stop("divergence", at, words)

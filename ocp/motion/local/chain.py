@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -21,8 +21,7 @@ from models.checks import Array
 from models.spatial import Frame, cross, expression, rotation
 from ocp.problem.values import Sampler
 
-TURN = 2 * np.pi
-"""Angle of a full turn, rad."""
+TURN = 2 * np.pi  # angle of a full turn, rad
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,8 @@ class NewtonSettings:
     exact: float = 1e-10  # largest pose error of a solution, also in rad
     rough: float = 0.5  # pose error above which a candidate is dropped, also in rad
     largest_step: float = 1.0  # largest change of a joint in a step, rad or m
-    # added to the squared singular values of the Jacobian, so that steps stay finite at singularities
-    damping: float = 1e-14
-    # least singular value of the Jacobian of a regular solution. Below it a further solution may lie so near that
-    # rounding errors hide it
-    singular: float = 1e-5
+    damping: float = 1e-14  # added to the squared singular values of the Jacobian: finite at singularities
+    singular: float = 1e-5  # least singular value of a regular solution; below it a further one may be hidden
     same: float = 1e-7  # distance below which two solutions count as one, rad or m
     near: float = 1e-2  # distance up to which two solutions count as one if the pose is exact halfway between them
 
@@ -106,9 +102,7 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the coefficients of 1, cos(angle), sin(angle) in the scalar product of a fixed vector and a vector
-        rotated about the axis by sign times the angle. Shape (1, 3).
-        """
+        """Return the coefficients (1, 3) of 1, cos(q), sin(q) in fixed . (vector rotated about the axis by sign q)."""
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
@@ -125,17 +119,11 @@ def inverse(frame: Frame) -> Frame:
 
 
 class Solutions(NamedTuple):
-    """Solutions of the inverse kinematics of an arm at M poses of its tip.
+    """Solutions of the inverse kinematics of an arm at M poses of its tip."""
 
-    Attributes:
-        pose: Index of the pose of each solution. Shape (K,).
-        joints: Joint positions, those of revolute free joints between -pi and pi. Shape (K, n).
-        singular: Which solutions are so near a singularity that others may hide there. Shape (K,), bool.
-    """
-
-    pose: NDArray[np.intp]
-    joints: Array
-    singular: NDArray[np.bool_]
+    pose: NDArray[np.intp]  # index of the pose of each solution, (K,)
+    joints: Array  # (K, n), those of revolute free joints between -pi and pi
+    singular: NDArray[np.bool_]  # which solutions are so near a singularity that others may hide there, (K,)
 
     @classmethod
     def none(cls, size: int) -> Solutions:
@@ -145,23 +133,15 @@ class Solutions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Serial chain of an arm: its joint axes at the zero configuration, in world coordinates.
+    """Serial chain of an arm: its joint axes at the zero configuration, in world coordinates."""
 
-    Attributes:
-        axes, points: Directions of the axes of all joints, and points on them. Shapes (n, 3), m.
-        revolute: Which joints are revolute; the others are prismatic. Shape (n,), bool.
-        position, rotation: Pose of the tip. Shapes (3,), (3, 3).
-        order: Indices of the joints that move the tip, from the base to the tip.
-        size: Largest distance of an axis from the tip, m.
-    """
-
-    axes: Array
-    points: Array
-    revolute: NDArray[np.bool_]
-    position: Array
-    rotation: Array
-    order: tuple[int, ...]
-    size: float
+    axes: Array  # directions of the axes of all joints, (n, 3)
+    points: Array  # points on these axes, (n, 3), m
+    revolute: NDArray[np.bool_]  # which joints are revolute; the others are prismatic, (n,)
+    position: Array  # of the tip, (3,), m
+    rotation: Array  # of the tip, (3, 3)
+    order: tuple[int, ...]  # indices of the joints that move the tip, from the base to the tip
+    size: float  # largest distance of an axis from the tip, m
 
     @classmethod
     def of(cls, machine: Machine) -> Chain | None:
@@ -244,13 +224,8 @@ class Chain:
         return errors, jacobians.transpose(0, 2, 1)
 
     def refine(self, pose: NDArray[np.intp], joints: Array, free: Sequence[int], goal: Motion) -> Solutions:
-        """Refine rough IK solutions by Newton's method in the free joints; return the distinct solutions.
-
-        Args:
-            pose: Index of the pose of each rough solution. Shape (K,).
-            joints: Rough solutions. Shape (K, n).
-            free: Indices of the free joints; the others keep their positions.
-            goal: Poses of the tip in the world, M of them.
+        """Refine rough IK solutions `joints` (K, n), of the goal poses with index `pose` (K,), by Newton's method in
+        the free joints; return the distinct solutions.
         """
         joints, numbers = joints.copy(), np.array(free, dtype=int)
         error, jacobians = np.full(len(joints), np.inf), np.zeros((len(joints), 6, len(numbers)))
@@ -278,12 +253,8 @@ class Chain:
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the IK solutions of several poses without duplicates, ordered by pose, with angles from -pi to pi.
-
-        Args:
-            solutions: The solutions.
-            numbers: Indices of the joints that distinguish solutions.
-            goal: Poses of the tip, M of them.
+        """Return the IK solutions of goal poses without duplicates, ordered by pose, with angles from -pi to pi; they
+        are distinguished by the joints with given indices.
         """
         pose, joints, singular = solutions
         free = np.array(numbers, dtype=int)
@@ -308,7 +279,7 @@ class Chain:
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
-        return _pairs(len(pose))
+        return np.triu_indices(len(pose), 1)
     first = np.arange(len(pose))[:, None]
     second = first + np.arange(1, int(np.bincount(pose).max()))
     same_pose = second < len(pose)
@@ -317,20 +288,11 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
     return first, second
 
 
-@lru_cache(maxsize=64)
-def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and the second elements of all pairs of the numbers 0 to count - 1. Shapes (P,)."""
-    return np.triu_indices(count, 1)
-
-
 def _damped_steps(jacobian: Array, missed: Array) -> Array:
     """Return the joint steps (K, m) of Newton's method for pose errors (K, 6), damped at singularities."""
-    transposed, error = jacobian.transpose(0, 2, 1), missed[:, :, None]
-    if jacobian.shape[2] < 6:
-        normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
-        return np.asarray(np.linalg.solve(normal, transposed @ error)[:, :, 0])
-    normal = jacobian @ transposed + NEWTON.damping * np.eye(6)
-    return np.asarray((transposed @ np.linalg.solve(normal, error))[:, :, 0])
+    transposed = jacobian.transpose(0, 2, 1)
+    normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
+    return np.asarray(np.linalg.solve(normal, transposed @ missed[:, :, None])[:, :, 0])
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:

@@ -34,26 +34,30 @@ from ocp.problem.values import Sampler
 Mask: TypeAlias = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class NearbySettings:
-    """Settings of the search for IK solutions that a solver may have missed at a pose, by solving for poses nearby."""
+TINY = 1e-300  # small number that is added to divisors to avoid divisions by zero
+SIX, SCARA = 6, 4  # numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA
 
+
+@dataclass(frozen=True)
+class FormSettings:
+    """Settings of closed-form inverse kinematics; lengths are relative to the size of the arm."""
+
+    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
+    near: float = 1e-3  # residual up to which rough solutions, as near double ones, are refined
+    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
+    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
+    # solutions that a solver may have missed at a pose are searched by solving for poses nearby
     pairs: int = 2  # number of pairs of nearby poses for each pose
-    distance: float = 1e-3  # typical distance of nearby poses, rad and share of the size of the arm
+    distance: float = 1e-3  # typical distance of nearby poses, also in rad
     seed: int = 0  # seed of the directions of nearby poses
 
 
-NEARBY = NearbySettings()
+FORMS = FormSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSolver(ABC):
-    """Base class of solvers of the inverse kinematics of a chain for given positions of its redundant joints.
-
-    Attributes:
-        chain: The chain.
-        redundant: Indices of the joints whose positions are given.
-    """
+    """Base class of solvers of the inverse kinematics of a chain for given positions of its redundant joints."""
 
     chain: Chain
     redundant: tuple[int, ...]
@@ -67,13 +71,8 @@ class PoseSolver(ABC):
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return the IK solutions at M poses of the tip; at singular poses some solutions may be missing.
 
-        Args:
-            tips: Poses of the tip in the world.
-            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
-
-        Returns:
-            The solutions; masks of the poses where it must be confirmed that these are all, and of those where some may
-            be missing. Shapes (M,), bool.
+        `redundant` has the positions of the redundant joints, (M, k). Return also masks (M,) of the poses where it must
+        be confirmed that these are all, and of those where some may be missing.
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
@@ -81,10 +80,6 @@ class PoseSolver(ABC):
 
         Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
         continuously on the pose, and of a family some members are found.
-
-        Args:
-            positions, rotations: Poses of the tip in the world. Shapes (M, 3), (M, 3, 3).
-            redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
         """
         tips, count = Motion(rotations, positions), len(positions)
         solutions, unconfirmed, doubtful = self.solve_regular(tips, redundant)
@@ -101,44 +96,19 @@ class PoseSolver(ABC):
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
         """Yield poses near the given poses, in pairs on opposite sides, at which missing solutions may be found."""
-        rng = np.random.default_rng(NEARBY.seed)
-        for _ in range(NEARBY.pairs):
-            turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
+        rng = np.random.default_rng(FORMS.seed)
+        for _ in range(FORMS.pairs):
+            turn, shift = FORMS.distance * rng.normal(size=(2, 3))
             for sign in (1.0, -1.0):
                 yield Motion(tips.turn @ rotation_matrices(sign * turn), tips.shift + sign * self.chain.size * shift)
 
 
-TINY = 1e-300
-"""Small number that is added to divisors to avoid divisions by zero."""
-SIX, SCARA = 6, 4
-"""Numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA."""
-
-
-@dataclass(frozen=True)
-class FormSettings:
-    """Tolerances of closed-form inverse kinematics; lengths are relative to the size of the arm."""
-
-    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
-    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
-    near: float = 1e-3
-    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
-    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
-
-
-FORMS = FormSettings()
-
-
 @dataclass(frozen=True, eq=False)
 class ClosedForm(PoseSolver):
-    """Solver of the inverse kinematics of an arm in closed form.
+    """Solver of the inverse kinematics of an arm in closed form."""
 
-    Attributes:
-        kind: "meeting" or "parallel", by the axes of three of its joints, or "scara".
-        triple: Indices of these joints.
-    """
-
-    kind: str
-    triple: tuple[int, ...]
+    kind: str  # "meeting" or "parallel", by the axes of three of its joints, or "scara"
+    triple: tuple[int, ...]  # indices of these joints
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return IK solutions at M poses of the tip; continuous families of solutions may be incomplete."""
@@ -197,9 +167,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a tip pose that returns candidate angles of the first and the third joint of `_loop`, x and z,
-        with their residuals and conditioning.
-        """
+        """Function of a tip pose: candidate angles of the joints x and z of `_loop`, residuals and conditioning."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -242,31 +210,26 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
+    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose."""
 
-    Attributes:
-        symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
-        axes: Axes of the joints.
-        order: Indices of the joints.
-        goal: The goal.
-    """
-
-    symbols: Any
+    symbols: Any  # positions of the redundant joints, rows of the rotation of the tip, its position, (k + 12,)
     axes: list[SymbolicAxis]
-    order: list[int]
+    order: list[int]  # indices of the joints
     goal: Frame
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers of a chain, one for each choice of redundant joints that has a closed form.
-
-    Args:
-        chain: The chain.
-        lockable: Indices of the joints that may be redundant; None: all.
-    """
+    """Return the closed-form solvers of a chain, one for each choice of redundant, `lockable` joints that has one."""
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
-    return _six_joint_forms(chain, chain.order if lockable is None else tuple(lockable))
+    n, forms = len(chain.order), list[ClosedForm]()
+    for redundant in combinations(chain.order if lockable is None else lockable, n - SIX) if n >= SIX else ():
+        if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
+            continue
+        triples = [chain.order[i : i + 3] for i in range(n - 2)]
+        kinds = [(_kind_of(chain, triple), triple) for triple in triples if not set(triple) & set(redundant)]
+        forms += [ClosedForm(chain, redundant, kind, triple) for kind, triple in sorted(kinds) if kind][:1]
+    return tuple(forms)
 
 
 def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
@@ -282,18 +245,6 @@ def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
 def is_scara(chain: Chain) -> bool:
     """Return whether a chain is a SCARA: three parallel revolute joints and a prismatic one along them."""
     return len(chain.order) == SCARA and bool(_scara_forms(chain))
-
-
-def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers with six free revolute joints, one for each suitable set of redundant joints."""
-    n, forms = len(chain.order), list[ClosedForm]()
-    for redundant in combinations(lockable, n - SIX) if n >= SIX else ():
-        if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
-            continue
-        triples = [chain.order[i : i + 3] for i in range(n - 2)]
-        kinds = [(_kind_of(chain, triple), triple) for triple in triples if not set(triple) & set(redundant)]
-        forms += [ClosedForm(chain, redundant, kind, triple) for kind, triple in sorted(kinds) if kind][:1]
-    return tuple(forms)
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
@@ -369,10 +320,10 @@ def _rotation(angle: Any) -> Any:
 
 
 def _close_roots(f: Harmonics) -> Any:
-    """Return eight angles that include all roots of a trigonometric polynomial; double roots become close pairs.
+    """Return eight angles (8, 1) that include all roots of a trigonometric polynomial; double roots become close pairs.
 
     Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
-    curvature there has both. Shape (8, 1).
+    curvature there has both.
     """
     size = TINY + sum(map(ca.fabs, f))
     f = Harmonics(*(part / size for part in f))
@@ -388,16 +339,14 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the mean and half the difference of the two roots q of cosine cos(q) + sine sin(q) = value, or of the
-    nearest equation that has a root.
-    """
+    """Return mean and half the difference of the roots q, or nearest angles, of cosine cos(q) + sine sin(q) = value."""
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions for three joints whose axes meet or are parallel and that must produce a given rotation or
-    planar motion, and the share by which this motion is out of their reach; the solutions are then the nearest.
+    """Return two solutions for three joints that must produce a rotation, if their axes meet, or a planar motion, if
+    they are parallel, and the share by which this motion is out of their reach; the solutions are then the nearest.
     """
     a, b, c = axes
     goal_point = goal.point(c.point)

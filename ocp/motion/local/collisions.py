@@ -25,21 +25,13 @@ from ocp.tolerances import STANDSTILL
 
 
 class Collision(NamedTuple):
-    """Pair of bodies that are closer to each other than the clearance at a time of a motion.
+    """Pair of bodies that are closer to each other than the clearance at a time of a motion."""
 
-    Attributes:
-        pair: Index in `CollisionScene.pairs`.
-        bodies: Names of the bodies.
-        distance: Distance, m, negative if they overlap.
-        time: Time, s.
-        protrusion: How much closer the bodies are that cover meshes and that separation constraints use instead, m.
-    """
-
-    pair: int
+    pair: int  # index in `CollisionScene.pairs`
     bodies: tuple[str, str]
-    distance: float
-    time: float
-    protrusion: float = 0.0
+    distance: float  # m, negative if they overlap
+    time: float  # s
+    protrusion: float = 0.0  # how much closer the bodies are that cover meshes in separation constraints, m
 
     def __str__(self) -> str:
         how = f"overlap by {-self.distance:.3g} m" if self.distance < 0 else f"are {self.distance:.3g} m apart"
@@ -70,10 +62,7 @@ def distances_along(
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
     Args:
-        scene: Collision scene of the machine that moves.
-        base: Base configurations, shape (M, base_size) or (base_size,).
-        joints: Joint positions. Shape (M, joint_size).
-        times: Times, s. Shape (M,).
+        base, joints, times: Samples of the motion; one base (base_size,) is enough if it does not move.
         cutoff: For pairs farther apart than this, m, a lower bound of at least `cutoff` may be returned.
         pairs: Indices of the only pairs that count; the distances of the others are infinite. All if None.
     """
@@ -90,15 +79,9 @@ def near_pairs(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
     """Return the pairs of bodies, among fixed obstacles, that are closer than the clearance plus `reach`, m.
 
-    Args:
-        scene: Collision scene of a machine on a fixed base.
-        joints: Configurations. Shape (M, n).
-        reach: Largest distance beyond the clearance, m.
-        gradients: Whether gradients are computed, by finite differences; they are 0 otherwise.
-
     Returns:
-        Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient, shape
-        (K, n).
+        Configuration, among (M, n) of a fixed base, and pair of each; its distance beyond the clearance, m, shape (K,);
+            and the gradient of this distance, by finite differences, or 0 without `gradients`, shape (K, n).
     """
     (placements, bodies), n, near = prepared_pairs(scene), joints.shape[1], scene.clearance + reach
 
@@ -120,10 +103,7 @@ def near_pairs(
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
-    """Return the pairs of bodies that come closer than the clearance, at their closest samples, sorted by distance.
-
-    The arguments are those of `distances_along`.
-    """
+    """Return the pairs of bodies that come closer than the clearance, at their closest samples, sorted by distance."""
     distances = distances_along(scene, base, joints, times, cutoff=scene.clearance)
     if not distances.size:
         return []
@@ -136,10 +116,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 def worst_collisions(
     scene: CollisionScene, base: Array, joints: Array, times: Array, *, pairs: Sequence[int] | None = None
 ) -> list[Collision | None]:
-    """Return for each sample the closest pair of bodies if it violates the clearance by more than rounding, else None.
-
-    The arguments are those of `distances_along`.
-    """
+    """Return for each sample the closest pair of bodies that violates the clearance by more than rounding, or None."""
     distances = distances_along(scene, base, joints, times, cutoff=scene.clearance, pairs=pairs)
     worst = list[Collision | None]([None] * len(joints))
     for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance - STANDSTILL).tolist():
@@ -167,10 +144,7 @@ def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return the cached evaluators of the body frames and of the pair distances of a collision scene.
-
-    The arguments of the evaluator of body frames are base, joints and time.
-    """
+    """Return the cached evaluators of body frames, of (base, joints, time), and of pair distances of a scene."""
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine
@@ -184,9 +158,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene; raise ProblemError if it belongs to another machine, or assumes that joints stay within
-    their limits although `limits` is False.
-    """
+    """Return a collision scene; raise ProblemError if it is of another machine, or assumes limits that do not hold."""
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
@@ -202,12 +174,10 @@ class SlidingSettings:
     """Settings of `slide_apart`, which moves configurations out of collision along self-motions."""
 
     steps: int = 12  # largest number of steps
-    # step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m
-    difference: float = 1e-5
+    difference: float = 1e-5  # step of the finite differences, rad or m: the root of the rounding error of distances
     longest: float = 0.25  # longest step of a joint, rad or m
     damping: float = 0.1  # damping relative to the size of the gradients
-    # distance in excess of the clearance, so that correcting the tips does not use up the clearance, m
-    spare: float = 2e-3
+    spare: float = 2e-3  # distance beyond the clearance that correcting the tips may use up, m
 
 
 SLIDING = SlidingSettings()
@@ -224,19 +194,10 @@ def slide_apart(
     lower: Array,
     upper: Array,
 ) -> Array:
-    """Move configurations out of collision along their self-motion manifolds, as far as necessary or possible.
+    """Move configurations (K, n) out of collision along their self-motion manifolds, as far as necessary or possible.
 
-    Args:
-        scene: Collision scene of the machine.
-        base: Base configuration. Shape (base_size,).
-        joints: Configurations that satisfy the task. Shape (K, n).
-        time: Time, s.
-        jacobian: Jacobian of the task at a configuration (n,). Shape (m, n).
-        back: Function from configurations (K, n) to nearby ones that satisfy the task again.
-        lower, upper: Limits of the joints. Shape (n,).
-
-    Returns:
-        For each configuration the one on its path with the largest minimum distance. Shape (K, n).
+    Return for each the one on its path with the largest minimum distance. `jacobian` gives the Jacobian (m, n) of the
+    task at a configuration (n,), and `back` moves configurations to nearby ones that satisfy the task again.
     """
     count, n = joints.shape
     target = scene.clearance + SLIDING.spare

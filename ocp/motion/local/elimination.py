@@ -7,10 +7,10 @@ direction of its axis, so that a point p on it and its direction l satisfy
 
 On both sides take the 15 numbers 1, p, p.p, l, p.l, p x l and p.p l - 2 p.l p: the conformal coordinates of the point
 and of the line element in it. Each joint acts on them by a matrix that is linear in cos q and sin q, or quadratic in a
-displacement: both are quadratic forms on the projective line, 1, cos h and sin h of an angle h with q = h, or
-q = size tan(h / 2). The 15 x 9 matrix of the products of x and y has a left null space of six rows, which removes x and
-y; times cos(h / 2) and sin(h / 2) of one of z, a, b they are twelve equations, linear in twelve products of that angle
-and another one and quadratic in the third: a polynomial eigenvalue problem with 24 eigenvalues. At most 16 of them are
+displacement: both are quadratic forms on the projective line, 1, cos h and sin h of an angle h with q = h, or q = size
+tan(h / 2). The 15 x 9 matrix of the products of x and y has a left null space of six rows, which removes x and y; times
+cos(h / 2) and sin(h / 2) of one of z, a, b they are twelve equations, linear in twelve products of that angle and
+another one and quadratic in the third: a polynomial eigenvalue problem with 24 eigenvalues. At most 16 of them are
 solutions; half-angles are rotated such that no solution is at infinity.
 
 The loop may be opened at any of its joints, and each opening leaves six ways to choose the angles. Where axes meet or
@@ -27,21 +27,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
+from models.spatial import rotation_matrices
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
+# angles h at which a function is sampled to find its coefficients of 1, cos h and sin h
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
-"""Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
-NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
-"""Matrix that maps a vector to the entries of its cross product matrix, row by row."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
-
-
+# coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2
 PRODUCTS = np.array(
     [[[1, 0, 0, 0], [0, 1, 0, 0]], [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]], [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]]
 )
-"""Coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2."""
 
 
 @dataclass(frozen=True)
@@ -50,17 +46,12 @@ class EliminationSettings:
 
     rank: float = 1e-9  # singular values of the eliminated products below this share of the largest count as zero
     regular: float = 1e-11  # reciprocal condition number below which an eigenvalue problem counts as singular
-    # distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double eigenvalues
-    # of an ill-conditioned problem
-    real: float = 3e-2
+    real: float = 3e-2  # distance of exp(i h) from the unit circle below which an angle h may be real
     probably_real: float = 1e-4  # distance below which a multiple eigenvalue counts as real
     surely_real: float = 1e-7  # distance below which a simple eigenvalue is real
-    # deviation of an eigenvector from the products of one solution below which its eigenvalue is simple
-    simple: float = 1e-4
-    # angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken
-    poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
-    # distance of a solution from a configuration of the trial below which they are the same, rad or m
-    same: float = 1e-5
+    simple: float = 1e-4  # deviation of an eigenvector from products below which its eigenvalue is simple
+    poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)  # angles h at which the half-angle may be infinite
+    same: float = 1e-5  # distance of a solution from a configuration of the trial to be the same, rad or m
     trials: int = 12  # number of random configurations of the trial
     openings: int = 3  # largest number of eigenvalue problems that are solved at a doubtful pose
     seed: int = 0  # seed of the trial
@@ -69,26 +60,13 @@ class EliminationSettings:
 ELIMINATION = EliminationSettings()
 
 
-def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of arrays of vectors along their last axis."""
-    return np.asarray(np.vecdot(a, b))
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of arrays of vectors along their last axis, faster than numpy for small arrays."""
-    return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
-
-
 def axial(turn: Array) -> Array:
     """Return the axial vectors (M, 3) of rotation matrices (M, 3, 3), which are 2 sin(angle) times the axis."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 
 class Axis(NamedTuple):
-    """Axis of a joint at M poses: unit directions (M, 3), points on it (M, 3), and whether the joint is revolute.
-
-    A single row, (1, 3), applies to all poses.
-    """
+    """Axis of a joint, unit direction and point on it: at each of M poses, (M, 3), or for all poses, (1, 3)."""
 
     direction: Array
     point: Array
@@ -106,24 +84,16 @@ class Axis(NamedTuple):
         """Return the rigid motions that the joint causes at joint positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
-        skew = (self.direction @ SKEW).reshape(-1, 3, 3)
-        sine, versine = np.sin(position)[:, None, None], (1 - np.cos(position))[:, None, None]
-        turn = np.eye(3) + sine * skew + versine * (skew @ skew)
+        turn = rotation_matrices(position[:, None] * self.direction)
         return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
 
 
 class LoopOpening(NamedTuple):
-    """Choice of the joint at which the kinematic loop is opened, and of the roles of the joints in the elimination.
+    """Choice of the joint at which the kinematic loop is opened, and of the roles of the joints in the elimination."""
 
-    Attributes:
-        first: Index of the joint x; the others follow in the order of the loop.
-        rank: Number of independent products of x and y at a regular pose.
-        roles: Which of z, a, b is the eigenvalue, which has products with half-angles, and which remains.
-    """
-
-    first: int
-    rank: int
-    roles: tuple[int, int, int]
+    first: int  # index of the joint x; the others follow in the order of the loop
+    rank: int  # number of independent products of x and y at a regular pose
+    roles: tuple[int, int, int]  # which of z, a, b has the eigenvalue, half-angles, and the rest
 
 
 class _Loop(NamedTuple):
@@ -135,37 +105,23 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate IK solutions that one choice of the joint at which the closed kinematic loop is opened yields.
+    """Candidate IK solutions that one choice of the joint at which the closed kinematic loop is opened yields."""
 
-    Attributes:
-        pose: Index of the pose of each candidate. Shape (K,).
-        free: Positions of the free joints. Shape (K, 6).
-        least: How many solutions each pose has at least, from simple real eigenvalues. Shape (M,).
-        mixed: Which poses have multiple real eigenvalues. Shape (M,), bool.
-        singular: Which poses have a singular problem. Shape (M,), bool.
-    """
-
-    pose: NDArray[np.intp]
-    free: Array
-    least: NDArray[np.intp]
-    mixed: Mask
-    singular: Mask
+    pose: NDArray[np.intp]  # index of the pose of each candidate, (K,)
+    free: Array  # positions of the free joints, (K, 6)
+    least: NDArray[np.intp]  # how many solutions each pose has at least, from simple real eigenvalues, (M,)
+    mixed: Mask  # which poses have multiple real eigenvalues, (M,)
+    singular: Mask  # which poses have a singular problem, (M,)
 
 
 @dataclass(frozen=True, eq=False)
 class Elimination(PoseSolver):
-    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it.
+    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it."""
 
-    Attributes:
-        openings: Openings of the loop that have regular problems, the best first.
-    """
-
-    openings: tuple[LoopOpening, ...]
+    openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip; at singular poses some may be missing.
-
-        See `PoseSolver.solve_regular`.
+        """Return the IK solutions at M poses of the tip, see `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -257,10 +213,8 @@ def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Separate the terms of the first two joints of a loop, which are eliminated, from the terms of the other joints.
-
-    Return singular vectors (M, 15, 15) and ranks (M,) of the terms to eliminate, and coefficients (M, 15, 3, 3, 3) of
-    the other terms, or (1, ...) if these are the same for all poses.
+    """Return singular vectors (M, 15, 15) and ranks (M,) of the terms of the first two joints of a loop, which are
+    eliminated, and coefficients (M or 1, 15, 3, 3, 3) of the terms of the other joints.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -274,9 +228,8 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coefficients (M, 15, 3, ...) with which the conformal coordinates of a line element depend on 1, cos h
-    and sin h of the joints that move it, of the last one first; `axes` begins with the joint that moves the line
-    element first.
+    """Return the coefficients (M, 15, 3, ...) of the conformal coordinates of a line element in 1, cos h and sin h of
+    the joints that move it, the last one first; `axes` begins with the joint that moves the line element first.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
@@ -286,8 +239,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
             cosine, sine = (part[:, None, None] for part in (np.cos(SAMPLES), np.sin(SAMPLES)))
             moved = []
             for vector in (point[:, None] - p, direction[:, None]):
-                along = dot(vector, w)[..., None] * w
-                moved.append(along + cosine * (vector - along) + sine * cross(w, vector))
+                along = np.vecdot(vector, w)[..., None] * w
+                moved.append(along + cosine * (vector - along) + sine * np.cross(w, vector))
             moved[0] = moved[0] + p
         else:
             shifts = np.tan(SAMPLES / 2)[:, None, None] * w
@@ -298,8 +251,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
         scale = np.ones(3) if axis.revolute else np.cos(SAMPLES / 2) ** 2
         weights = (scale[:, None] * weights).ravel()
         point, direction = (part.reshape(len(point), -1, 3) for part in moved)
-    square, along = dot(point, point)[..., None], dot(point, direction)[..., None]
-    parts = [np.ones_like(square), point, square, direction, along, cross(point, direction)]
+    square, along = np.vecdot(point, point)[..., None], np.vecdot(point, direction)[..., None]
+    parts = [np.ones_like(square), point, square, direction, along, np.cross(point, direction)]
     values = np.concatenate([*parts, square * direction - 2 * along * point], axis=2) * weights[:, None]
     values = values.transpose(0, 2, 1).reshape(len(point), 15, *[3] * len(axes))
     for k in range(len(axes)):
@@ -308,9 +261,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the coefficients of 1, cos h and sin h in the eigenvalue problem of an opened kinematic loop, h the angle
-    of the joint that has the eigenvalue. Shape (M, 3, 12, 12).
-    """
+    """Return the coefficients (M, 3, 12, 12) of 1, cos h and sin h, h the eigenvalue angle, in the problem."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -324,9 +275,8 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices of eigenvalue problems, the angles at eigenvalue 0, and reciprocal condition numbers.
-
-    The problems are polynomial; the eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
+    """Return companion matrices (M, 24, 24), the angles (M,) at eigenvalue 0, and reciprocal condition numbers (M,) of
+    polynomial eigenvalue problems, whose eigenvalues are tan((h - pole) / 2) of an angle h.
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))
@@ -426,8 +376,8 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
             continue
         parts = []
         for vector, origin, unit in ((point - axis.point, axis.point, size), (direction, 0.0, 1.0)):
-            along = dot(vector, axis.direction)[:, None] * axis.direction
-            parts.append(((origin + along) / unit, (vector - along) / unit, cross(axis.direction, vector) / unit))
+            along = np.vecdot(vector, axis.direction)[:, None] * axis.direction
+            parts.append(((origin + along) / unit, (vector - along) / unit, np.cross(axis.direction, vector) / unit))
         constant, cosine, sine = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         columns += [sign * cosine, sine]
         constants.append(sign * constant)
@@ -438,5 +388,5 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
         for axis, part in ((x, solved[:, :2]), (y, solved[:, 2:]))
     )
     rest = x.motion(first).after(y.motion(second)).after(motion).inverse.after(goal).turn
-    last = np.arctan2(dot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
+    last = np.arctan2(np.vecdot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
     return np.column_stack([first, second, middle, last])

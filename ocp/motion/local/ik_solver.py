@@ -1,10 +1,17 @@
-"""All inverse kinematics solutions (IK configurations) of an arm at poses of its tip, and whether they are complete."""
+"""All inverse kinematics solutions (IK configurations) of an arm at poses of its tip, and whether they are complete.
+
+Six joints are solved for at once, in closed form or by elimination; redundant joints are sampled. Tasks that leave the
+orientation of the tip open and arms of fewer joints are brought to that form by revolute joints that the arm does not
+have, between its last joint and the tip: one about the tool axis if the roll is open, three about the tip if the
+orientation is; and auxiliary ones if there are still fewer than six, which must stay at zero.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, Flag, auto
-from functools import cached_property
+from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -15,14 +22,32 @@ from models.checks import Array, ArrayInput
 from models.machines.machine import with_tip
 from models.spatial import least_rotation, rotation_matrices
 from ocp.errors import ProblemError, problem_errors, require
-from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
-from ocp.motion.local.chain import TURN, Chain
-from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
+from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
+from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms, is_scara
+from ocp.motion.local.elimination import elimination_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
 
-ROTATION_TOLERANCE = 1e-6
-"""Largest accepted entry of R R^T - 1 for a rotation matrix R."""
+ROTATION_TOLERANCE = 1e-6  # largest accepted entry of R R^T - 1 for a rotation matrix R
+STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
+"""Increments of the sampled parameters, as fractions of their ranges; irrational, so that no sample repeats."""
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Settings of the choice of redundant joints, whose positions are sampled in inverse kinematics."""
+
+    max_samples: int = 6  # largest number of sampled parameters
+    # largest number of choices of the sampled joints in closed form, and by elimination
+    max_solvers: tuple[int, int] = (6, 2)
+    trials: int = 32  # number of random configurations at which choices are compared
+    seed: int = 0  # seed of these configurations and of the axes of auxiliary joints
+    slide_range: float = 1.0  # prismatic joints without limits are sampled this far on either side of 0, m
+    auxiliary: float = 1e-3  # largest position of an auxiliary joint that is refined at zero, rad
+    excess: float = 1e-9  # largest excess over a limit that counts as rounding and is clipped, rad or m
+
+
+ARM = ArmSettings()
 
 
 class ToolFreedom(Enum):
@@ -94,6 +119,18 @@ def joint_range(machine: Machine, limits: bool) -> tuple[Array, Array]:
     return (machine.robot.lower, machine.robot.upper) if limits else (-unlimited, unlimited)
 
 
+def sampling_range(lower: Array, upper: Array, revolute: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return finite limits (n,) within which joints are sampled: a turn, or the slide range on either side, if free."""
+    span = np.where(revolute, np.pi, ARM.slide_range)
+    low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
+    return low, np.where(np.isfinite(upper), upper, low + 2 * span)
+
+
+def sample_shares(first: int, count: int, dimension: int) -> Array:
+    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on."""
+    return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
+
+
 class IkSolver:
     """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses.
 
@@ -141,11 +178,11 @@ class IkSolver:
         axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
-        prepared = PreparedArm.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
-        if prepared is None:
+        arm = ArmSolver.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
+        if arm is None:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
-        self.prepared, self.samples = prepared, int(samples)
+        self.arm, self.samples = arm, int(samples)
 
     def __repr__(self) -> str:
         sampled = f", {self.samples} samples of {' and '.join(self.parameters)}" if self.parameters else ""
@@ -154,7 +191,7 @@ class IkSolver:
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are sampled: redundant joints and angles that the task leaves open."""
-        return self.prepared.parameters(self.prepared.arm.solvers[0])
+        return self.arm.parameters(self.arm.solvers[0])
 
     def __call__(self, positions: ArrayInput, rotations: ArrayInput) -> IkConfigurations:
         """Return the IK configurations at one pose or N poses of the tip.
@@ -168,58 +205,52 @@ class IkSolver:
             ProblemError: A shape is wrong, a value is not finite, or a matrix is not a rotation.
         """
         places, turns = _checked_poses(positions, rotations)
-        solver = self.prepared.arm.solvers[0]
         dimension = len(self.parameters)
         count = self.samples if dimension else 1
         shares = (np.arange(count)[:, None] + 0.5) / count if dimension == 1 else sample_shares(0, count, dimension)
-        joints, pose, reasons = self.prepared.solve(solver, places, turns, shares[:, :dimension])
+        joints, pose, reasons = self.arm.solve(self.arm.solvers[0], places, turns, shares[:, :dimension])
         return IkConfigurations(joints, pose, self.parameters, reasons)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedArm:
-    """Arm with the solver of its inverse kinematics and the part of the tip's orientation that a task leaves free.
+class ArmSolver:
+    """Solver of all inverse kinematics solutions of an arm within its limits and of partly free orientations."""
 
-    Attributes:
-        arm: Solver of the arm.
-        free: Part of the orientation that the task leaves free.
-        tool_axis: Axis of the roll in the frame of the tip.
-        sampled_angles: Number of free angles that are sampled.
-        within: Half-angle of the cone, rad.
-        names: Names of the joints.
-    """
-
-    arm: ArmSolver
+    chain: Chain
+    solvers: tuple[PoseSolver, ...]  # for several choices of the sampled joints, the best-conditioned one first
+    auxiliary: tuple[int, ...]  # indices of the auxiliary joints of these solvers, which must stay at zero
+    lower: Array  # limits of the joints, infinite for unlimited ones, (n,)
+    upper: Array
     free: ToolFreedom
-    tool_axis: Array
-    sampled_angles: int
-    within: float
+    tool_axis: Array  # axis of the roll in the frame of the tip
+    within: float  # half-angle of the cone, rad
+    sampled_angles: int  # number of free angles that are sampled
     names: tuple[str, ...]
 
     @classmethod
     def of(
         cls, tip: Machine, lower: Array, upper: Array, *, free: ToolFreedom, tool_axis: Array, within: float = 0.0
-    ) -> PreparedArm | None:
+    ) -> ArmSolver | None:
         """Prepare an arm for inverse kinematics; return None if its base moves or no six joints determine its tip."""
         chain = Chain.of(tip)
         if chain is None or (free is ToolFreedom.CONE and len(chain.order) < SIX):
             return None
-        axis, axes, sampled = tool_axis / np.linalg.norm(tool_axis), None, 0
+        axis, axes, sampled = tool_axis / np.linalg.norm(tool_axis), np.zeros((0, 3)), 0
         if free is ToolFreedom.ROTATION:
             axes = np.eye(3)
         elif free is ToolFreedom.ROLL and len(chain.order) < SIX and not is_scara(chain):
             axes = (chain.rotation @ axis)[None]
         elif free is not ToolFreedom.NONE:
             sampled = 1 if free is ToolFreedom.ROLL else 3
-        arm = arm_solver(chain, lower, upper, axes)
-        if arm is None or len(arm.solvers[0].redundant) + sampled > ARM.max_samples:
+        solvers, auxiliary = _pose_solvers(chain, axes)
+        if not solvers or len(solvers[0].redundant) + sampled > ARM.max_samples:
             return None
-        return cls(arm, free, axis, sampled, within, tip.robot.joint_names)
+        return cls(chain, solvers, auxiliary, lower, upper, free, axis, within, sampled, tip.robot.joint_names)
 
     @property
     def complete(self) -> bool:
         """Whether all solutions can be found without sampling a parameter."""
-        return not (self.sampled_angles or self.arm.solvers[0].redundant)
+        return not (self.sampled_angles or self.solvers[0].redundant)
 
     def parameters(self, solver: PoseSolver) -> tuple[str, ...]:
         """Return the names of the parameters that are sampled if this solver is used."""
@@ -230,33 +261,30 @@ class PreparedArm:
     ) -> tuple[Array, NDArray[np.intp], tuple[Incompleteness, ...]]:
         """Return IK configurations (K, n), the indices (K,) of their poses, and why some may be missing at each pose.
 
-        Args:
-            solver: One of the solvers of the arm.
-            positions, rotations: Shapes (N, 3), (N, 3, 3).
-            shares: Samples of the parameters as shares of their ranges. Shape (S, k).
-            turns: Whether all whole turns are listed, or only the one farthest from the limits.
+        `shares` (S, k) samples the parameters as shares of their ranges. With `turns` all whole turns within the limits
+        are listed, else only the one farthest from the limits; unlimited joints are between -pi and pi.
         """
-        count, samples = len(positions), len(shares)
-        if (
-            self.free is ToolFreedom.ROTATION
-        ):  # any rotation will do, but not one at which the added joints are singular
+        count, samples, redundant = len(positions), len(shares), list(solver.redundant)
+        if self.free is ToolFreedom.ROTATION:  # any rotation at which the added joints are not singular
             rotations = np.tile(rotation_matrices(np.array([0.3, 0.5, 0.7])), (count, 1, 1))
-        redundant = self.arm.redundant_positions(solver, shares[:, : len(solver.redundant)])
+        prescribed = shares[:, : len(redundant)]
+        if redundant:
+            low, high = sampling_range(self.lower[redundant], self.upper[redundant], self.chain.revolute[redundant])
+            prescribed = low + prescribed * (high - low)
         if self.sampled_angles:
-            rotations = (rotations[:, None] @ self._rotations(shares[:, len(solver.redundant) :])).reshape(-1, 3, 3)
+            rotations = (rotations[:, None] @ self._rotations(shares[:, len(redundant) :])).reshape(-1, 3, 3)
         elif samples > 1:
             rotations = np.repeat(rotations, samples, axis=0)
-        if samples > 1:
-            positions, redundant = np.repeat(positions, samples, axis=0), np.tile(redundant, (count, 1))
-        elif count > 1:
-            redundant = np.repeat(redundant, count, axis=0)
-        solutions, doubtful = self.arm.solve(solver, positions, rotations, redundant, turns=turns)
+        goal = Motion(rotations, np.repeat(positions, samples, axis=0) if samples > 1 else positions)
+        solutions, doubtful = solver.solve(goal.shift, goal.turn, np.tile(prescribed, (count, 1)))
+        solutions = self._within_limits(self._of_the_arm(solver, solutions, goal), turns)
         pose, joints = solutions.pose // samples, solutions.joints
         if count > 1:
             order = np.argsort(pose, kind="stable")
             pose, joints = pose[order], joints[order]
-        if self._idle.any():
-            joints[:, self._idle] = idle_positions(self.arm.lower, self.arm.upper)[self._idle]
+        if len(self.chain.order) < joints.shape[1]:
+            idle = np.isin(np.arange(len(self.lower)), self.chain.order, invert=True)
+            joints[:, idle] = idle_positions(self.lower, self.upper)[idle]
         reasons = [Incompleteness(0) if self.complete else Incompleteness.SAMPLED] * count
         for k in set((solutions.pose[solutions.singular] // samples).tolist()):
             reasons[k] |= Incompleteness.SINGULAR
@@ -264,15 +292,44 @@ class PreparedArm:
             reasons[k] |= Incompleteness.ILL_CONDITIONED
         return joints, pose, tuple(reasons)
 
-    @cached_property
-    def _idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints that do not move the tip. Shape (n,), bool."""
-        return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
+    def _of_the_arm(self, solver: PoseSolver, solutions: Solutions, goal: Motion) -> Solutions:
+        """Return the solutions of a solver in the joints of the arm, without those that differ in added joints only."""
+        n, extended = len(self.chain.axes), solver.chain
+        if self.auxiliary:
+            still = (np.abs(solutions.joints[:, list(self.auxiliary)]) < ARM.auxiliary).all(axis=1)
+            joints = solutions.joints[still]
+            joints[:, list(self.auxiliary)] = 0.0
+            own = [j for j in solver.free if j not in self.auxiliary]
+            solutions = extended.refine(solutions.pose[still], joints, own, goal)
+        if len(extended.axes) > n + len(self.auxiliary):
+            solutions = extended.distinct(solutions, [j for j in solver.free if j < n], goal)
+        return solutions._replace(joints=solutions.joints[:, :n])
+
+    def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
+        """Return the IK solutions within the limits and, with `turns`, all whole-turn shifts that keep the limits."""
+        below, above, order = np.isfinite(self.lower), np.isfinite(self.upper), list(self.chain.order)
+        both, lower, upper = below & above & self.chain.revolute, self.lower - ARM.excess, self.upper + ARM.excess
+        start = np.where(
+            below, lower, upper - TURN
+        )  # lower end of the interval of one turn into which angles are shifted
+        if not turns:
+            start[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
+        shiftable = np.flatnonzero((below | above) & self.chain.revolute)
+        joints = solutions.joints.copy()
+        joints[:, shiftable] += TURN * np.ceil((start[shiftable] - joints[:, shiftable]) / TURN)
+        good = ((joints >= lower) & (joints <= upper))[:, order].all(axis=1)
+        rows, joints, several = np.flatnonzero(good), joints[good], np.flatnonzero(both & (upper - lower >= TURN))
+        if turns and several.size:
+            counts = 1 + ((upper[several] - joints[:, several]) // TURN).astype(int)
+            shifts = list(map(_whole_turns, map(tuple, counts.tolist())))
+            copies = np.repeat(np.arange(len(rows)), [len(each) for each in shifts])
+            rows, joints = rows[copies], joints[copies]
+            joints[:, several] += np.concatenate(shifts) if shifts else 0.0
+        joints[:, order] = np.clip(joints[:, order], self.lower[order], self.upper[order])
+        return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free, from fractions of
-        full turns of roll and azimuth and of the area of the cone's cap. Shape (S, 3, 3).
-        """
+        """Return samples (S, 3, 3) of the free rotations of the tip, from shares of roll, azimuth and cone area."""
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return rolled
@@ -281,6 +338,47 @@ class PreparedArm:
         azimuths = rotation_matrices(TURN * shares[:, 1:2] * self.tool_axis)
         tilts = np.arccos(1 - shares[:, 2:3] * (1 - np.cos(self.within)))  # uniform on the cap of the sphere
         return rotation_matrices(tilts * (azimuths @ across)) @ rolled
+
+
+@lru_cache(maxsize=256)
+def _whole_turns(counts: tuple[int, ...]) -> Array:
+    """Return all combinations of 0 to count - 1 whole turns of several joints, rad. Shape (combinations, joints)."""
+    return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
+
+
+def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
+    """Return the solvers of an arm, if any, and its auxiliary joints; the orientation about `axes` (k, 3) is open."""
+    extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
+    count, joints = len(extended.order), tuple(chain.order)
+    if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
+        return (), ()
+    if count == SCARA and (forms := closed_forms(extended)):
+        return forms, ()
+    auxiliary = tuple(range(len(extended.axes), len(extended.axes) + SIX - count))
+    if auxiliary:
+        rng = np.random.default_rng(ARM.seed)
+        directions = rng.normal(size=(len(auxiliary), 3))
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        extended = extended.extend(directions, chain.position + chain.size * rng.uniform(-1, 1, directions.shape))
+    solvers: list[PoseSolver] = list(closed_forms(extended, joints))
+    conditions = _conditions(extended, [solver.redundant for solver in solvers])
+    solvers = [solvers[k] for k in np.argsort(-conditions, kind="stable")[: ARM.max_solvers[0]]]
+    if not solvers:
+        choices = list(combinations(joints, max(count - SIX, 0)))
+        for k in np.argsort(-_conditions(extended, choices), kind="stable"):
+            solver = elimination_of(extended, choices[k])
+            solvers += [] if solver is None else [solver]
+            if len(solvers) == ARM.max_solvers[1]:
+                break
+    return tuple(solvers), auxiliary
+
+
+def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
+    """Return the geometric mean of the least singular value of the Jacobian for each choice of redundant joints."""
+    _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
+    columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
+    values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
+    return np.exp(np.log(np.maximum(values, 1e-300)).mean(axis=1)) if values else np.zeros(0)
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
@@ -301,35 +399,26 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """Solver of all IK configurations of a pose task at samples of its free parameters. Use `ik_branches` to create it.
+    """Solver of all IK configurations of a pose task at samples of its free parameters, see `ik_branches`."""
 
-    Attributes:
-        arm: The prepared arm.
-        complete: Whether the task leaves no parameter free, so that all configurations are listed.
-    """
-
-    def __init__(self, equations: TaskEquations, arm: PreparedArm) -> None:
+    def __init__(self, equations: TaskEquations, arm: ArmSolver) -> None:
         self.arm, self.complete = arm, arm.complete
         self._task = equations.bound[0].task
 
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return IK configurations of all branches within the joint limits, at samples of the free parameters.
-
-        Joints without limits are between -pi and pi.
+        """Return configurations at task targets (size,) and samples of the free parameters; unlimited angles up to pi.
 
         Args:
-            targets: Targets of the equations. Shape (size,).
             count: Number of samples of the free parameters, over several choices of the sampled joints.
             number: Number of the first sample; a different one gives other samples.
             turns: Whether all whole turns are listed, or only the one farthest from the limits.
-            choices: Largest number of choices of the sampled joints; None: all that have a solver. Each is singular at
-                other configurations.
+            choices: Largest number of choices of the sampled joints, each singular elsewhere; None for all.
         """
-        solvers = self.arm.arm.solvers[:choices]
+        solvers = self.arm.solvers[:choices]
         position, rotation = targets[None, :3], self._rotation(targets)[None]
-        parts, names, reason = list[Array](), dict[str, None](), None
+        parts, names, reason = list[Array](), dict[str, None](), Incompleteness(0)
         for solver in solvers:
             parameters = self.arm.parameters(solver)
             n = -(-count // len(solvers)) if parameters else 1
@@ -337,11 +426,10 @@ class IkBranches:
             joints, _, reasons = self.arm.solve(solver, position, rotation, shares, turns=turns)
             parts.append(joints)
             names |= dict.fromkeys(parameters)
-            reason = reasons[0] if reason is None else reason | reasons[0]
+            reason |= reasons[0]
             if not parameters and not reason:
                 break
         joints = np.concatenate(parts)
-        assert reason is not None
         return IkConfigurations(joints, np.zeros(len(joints), dtype=np.intp), tuple(names), (reason,))
 
     def _rotation(self, targets: Array) -> Array:
@@ -351,16 +439,14 @@ class IkBranches:
             return least_rotation(axis, direction)
         if self._task.orientation is not None and set(self._task.chosen) & set(ANGULAR):
             return np.asarray(targets[6:15].reshape(3, 3).T)
-        return self.arm.arm.chain.rotation
+        return self.arm.chain.rotation
 
 
 def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
-    """Return the solver of all IK branches of a pose task; None if no such solver exists for the task or machine.
+    """Return the solver of all IK branches of a task; None if no such solver exists for the task or machine.
 
-    Args:
-        equations: Equations of one pose of the tip of an arm in the world: the whole pose, a position and a direction
-            or a cone about it, a position alone, or, on a SCARA, a position and the rotation about its axes.
-        lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
+    There is one for a pose of the tip of an arm in the world: the whole pose, a position and a direction or a cone
+    about it, a position alone, or, on a SCARA, a position and the rotation about its axes.
     """
     if len(equations.bound) != 1:
         return None
@@ -382,7 +468,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
         free = ToolFreedom.ROTATION
     elif rotation < set(ANGULAR):
         return None
-    arm = PreparedArm.of(tip, lower, upper, free=free, tool_axis=axis, within=float(task.within or 0.0))
+    arm = ArmSolver.of(tip, lower, upper, free=free, tool_axis=axis, within=float(task.within or 0.0))
     return None if arm is None else IkBranches(equations, arm)
 
 
@@ -395,8 +481,7 @@ def ik_configurations(
 
     Args:
         machine: Machine on a fixed base.
-        task: A position, with an orientation, a direction, a cone or neither.
-        time: Time of the task, s.
+        task: A position, with an orientation, a direction, a cone or neither, at a `time`, s.
         limits: Whether the position limits of the robot apply.
         samples: Number of samples of the free parameters, if the arm is redundant for the task.
 

@@ -19,7 +19,7 @@ from models.checks import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
-from ocp.motion.local.ik_solver import ik_branches, joint_range
+from ocp.motion.local.ik_solver import ik_branches, joint_range, sampling_range
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
@@ -31,14 +31,12 @@ LARGEST_SEED = 2**64
 class IkSettings:
     """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions."""
 
-    slide_spread: float = 1.0  # range of the starts of prismatic joints without limits, m
     first_damping: float = 1e-2  # damping of the first step
     least_damping: float = 1e-12  # least damping
     most_damping: float = 1e8  # damping at which a start is abandoned
     growth: float = 4.0  # factor of the damping after a step that fails
     shrinkage: float = 0.25  # factor of the damping after a step that succeeds
-    # number of solutions in collision that are moved along their self-motions if no solution is free
-    slide_count: int = 8
+    slide_count: int = 8  # number of solutions in collision that are moved along their self-motions
 
 
 IK_SETTINGS = IkSettings()
@@ -77,18 +75,11 @@ IK_OPTIONS = IkOptions()
 
 @dataclass(frozen=True)
 class IkSolution:
-    """Solution of inverse kinematics: joint positions at a target pose.
+    """Solution of inverse kinematics: joint positions at a target pose."""
 
-    Attributes:
-        joints: Joint positions. Shape (joint_size,), rad or m.
-        quality: Manipulability of the task times the least distance of a joint from its limits, as a share of half its
-            range: 0 at a limit or a singularity.
-        pose_error: Largest remaining pose error of all tasks, m or rad.
-    """
-
-    joints: Array
-    quality: float
-    pose_error: float
+    joints: Array  # (n,), rad or m
+    quality: float  # manipulability times the least distance of a joint from its limits, as a share of half its range
+    pose_error: float  # largest remaining pose error of all tasks, m or rad
 
 
 class Unreachable(ProblemError):
@@ -135,10 +126,8 @@ def inverse_kinematics(
     """Return distinct configurations in which the machine satisfies its pose tasks, sorted by decreasing quality.
 
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
-    `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
-    parameters are listed. Damped Gauss-Newton iterations from random starts, each of which leads to one solution at
-    most, solve other tasks and machines. They complete lists that may be incomplete, or that have too few members
-    because few samples keep the limits.
+    `ik_configurations`, of a redundant arm at samples of its free parameters. Damped Gauss-Newton iterations from
+    random starts solve other tasks and machines. They complete lists that may be incomplete or have too few members.
 
     Args:
         machine: Any machine; a floating base does not move.
@@ -152,9 +141,6 @@ def inverse_kinematics(
         scene: Collision scene of the machine; solutions closer than the clearance are left out. If that leaves none,
             the ones with the largest distances are moved along their self-motions.
         options: Base, limits and accuracy.
-
-    Returns:
-        The solutions, at least one, by decreasing quality.
 
     Raises:
         Unreachable: No start leads to the pose, with the nearest miss; or no solution is collision-free, with the pair
@@ -217,9 +203,7 @@ def inverse_kinematics_at(
     near: Array | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return IK solutions of a fixed-base machine for numerical task targets, by iterations from initial guesses.
-
-    Unlike `inverse_kinematics`, this function does not list all branches first.
+    """Return IK solutions of a fixed-base machine for numerical task targets, by iterations from initial guesses alone.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -241,8 +225,7 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality; raise
-        Unreachable if there is none.
+        """Return the distinct IK solutions to which guesses (K, n) lead, by decreasing quality, or raise Unreachable.
 
         Unlimited angles that result from the last `random` guesses are wrapped to -pi .. pi.
         """
@@ -259,9 +242,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, none if there is no solver of all branches, and how many random
-        initial guesses shall be tried in addition.
-        """
+        """Return IK solutions (K, n) on all branches, if a solver lists these, and how many random guesses to add."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -306,10 +287,8 @@ class _MultiStart:
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
     """Return initial guesses: the configurations `near`, then `count` random ones within limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
-    prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
-    span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
-    low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
-    high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
+    revolute = np.array([joint.kind != "prismatic" for joint in machine.robot.moving_joints])
+    low, high = sampling_range(lower, upper, revolute)
     first = np.zeros((0, size)) if near is None else np.atleast_2d(require.array("near", near))
     if first.ndim != 2 or first.shape[1] != size:
         words = f"near has shape {first.shape}, ({size},) or (k, {size}) of finite numbers expected"
@@ -332,13 +311,8 @@ def gauss_newton(
 ) -> tuple[Array, Array]:
     """Run damped Gauss-Newton iterations from K starts; return joint positions (K, n) and largest residuals (K,).
 
-    Args:
-        function: CasADi Function of the joint positions and `fixed` that returns a residual and its Jacobian.
-        starts: Initial configurations. Shape (K, n).
-        lower, upper: Limits of the joints. Shape (n,).
-        tolerance: Largest residual of a solution.
-        iterations: Largest number of iterations.
-        fixed: Further arguments of the function, common to all starts.
+    `function` of the joint positions and `fixed` returns a residual and its Jacobian; `tolerance` is the largest
+    residual of a solution.
     """
     q = starts.copy()
     count, n = q.shape
@@ -435,12 +409,8 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return an error that inverse kinematics found no solution; it states the smallest pose error reached.
-
-    Args:
-        misses: Distance, m, and angle, rad, of the nearest configuration from the target.
-    """
-    names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
+    """Return an error that inverse kinematics found no solution; `misses` are the distance, m, and angle, rad, left."""
+    names = [part.name for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]
     where = f", with {at_limit} at their limits" if at_limit else ""

@@ -32,8 +32,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.values import Sampler, symbols_of
 
-MAX_INTEGRATOR_STEPS = 20000
-"""Largest number of integrator steps between two samples; a smooth motion takes some tens."""
+MAX_INTEGRATOR_STEPS = 20000  # largest number of integrator steps between two samples; a smooth motion takes some tens
 
 
 @dataclass(frozen=True)
@@ -42,10 +41,8 @@ class LocalSolution:
 
     Attributes:
         t: Times, the first 0. Shape (M,), s.
-        base: Base configuration, as the machine defines it. Shape (M, base_size).
-        joints: Joint positions. Shape (M, joint_size), rad or m.
-        joint_rates: Joint rates. Shape (M, joint_size).
-        base_rates: Time derivative of `base`. Shape (M, base_size).
+        base, joints: Base configuration and joint positions. Shapes (M, base_size), (M, joint_size).
+        base_rates, joint_rates: Their time derivatives.
         tip_in_world: Position of the tip. Shape (M, 3), m.
         manipulability: Undamped manipulability of the rows of the tasks. Shape (M,).
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
@@ -53,8 +50,7 @@ class LocalSolution:
         stopped: Reason why the motion ends before the horizon, None if it does not.
         clearance: Least distance of two bodies, m, nan without a collision scene. Shape (M,).
         nearest: Names of these two bodies at each time; empty without a collision scene.
-        task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows of
-            all tasks).
+        task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows).
     """
 
     t: Array
@@ -125,7 +121,8 @@ def resolve(
     """Compute a motion along tasks by resolved-rate control, with the least joint rates at each time.
 
     The joint rates are G# v, see `RateOptions`: equation (26) of Kim and Kim 2011 with u = 0. The drift of the machine
-    at rest and the feedback of pose tasks are part of v.
+    at rest and the feedback of pose tasks are part of v. The motion ends at the horizon, or at the last sample before
+    it breaks down, with the reason in `stopped`.
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
@@ -133,12 +130,8 @@ def resolve(
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
-        scene: Collision scene of the machine; the distances of its bodies are reported at the samples and have no
-            effect.
-        options: Weights, damping and tolerance; `RateOptions()` if None.
-
-    Returns:
-        The motion up to the horizon, or up to the last sample before it breaks down, with the reason in `stopped`.
+        scene: Collision scene of the machine; the distances of its bodies are reported and have no effect.
+        options: Weights, damping and tolerance.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the task is singular at the start.
@@ -160,25 +153,20 @@ def resolve(
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
     solution = _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
     if scene is None:
-        return replace(solution, clearance=np.full(len(solution.t), np.nan))
+        return solution
     distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
-    if not distances.shape[1]:
-        return replace(solution, clearance=np.full(len(solution.t), np.inf))
-    labels = scene.labels
-    nearest = tuple(labels[k] for k in distances.argmin(axis=1).tolist())
-    return replace(solution, clearance=distances.min(axis=1), nearest=nearest)
+    nearest = tuple(scene.labels[k] for k in distances.argmin(axis=1).tolist()) if distances.size else ()
+    return replace(solution, clearance=distances.min(axis=1, initial=np.inf), nearest=nearest)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the least joint rates for a task velocity, by the damped pseudo-inverse. Shape (n, k).
-
-    They are W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W the diagonal matrix of the weights.
+    """Return the least joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v. Shape (n, k).
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
         velocity: v, or several as columns. Shape (m, k).
-        damping: Damping, in units of the Jacobian.
-        weights: Positive weights of the squared joint rates. Shape (n,).
+        damping: In units of the Jacobian.
+        weights: Diagonal of W, weights of the squared joint rates; all 1 if None. Shape (n,).
     """
     weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
     square = ca.mtimes(jacobian, weighted) + damping**2 * ca.DM.eye(jacobian.shape[0])
@@ -288,6 +276,7 @@ def _report(
         tolerance=tolerance,
         stopped=stopped,
         task_error=error.reshape(size, len(times)).T,
+        clearance=np.full(len(times), np.nan),
     )
 
 
@@ -296,40 +285,24 @@ def _manipulabilities(jacobians: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobians, compute_uv=False).prod(axis=-1))
 
 
-CORRECTIONS = 2
-"""Number of Newton corrections of the pose after each step; each correction about squares the remaining error."""
+CORRECTIONS = 2  # number of Newton corrections of the pose after each step, each of which squares the error
 
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:
-    """K motions at M times from local redundancy resolution (resolved-rate control).
+    """K motions at M times from local redundancy resolution (resolved-rate control)."""
 
-    Attributes:
-        t: Times. Shape (M,), s.
-        base: Base configurations. Shape (K, M, base_size).
-        joints: Joint positions, within the limits. Shape (K, M, joint_size).
-        rates: Mean joint rates from each time to the next; the last ones are repeated. Shape (K, M, joint_size).
-        cost: Integral of half the weighted squared joint rates. Shape (K,).
-        pose_error: Largest pose error, m and rad; infinite if a motion diverges. Shape (K,).
-        worst_time: Time of the largest pose error, s. Shape (K,).
-    """
-
-    t: Array
-    base: Array
-    joints: Array
-    rates: Array
-    cost: Array
-    pose_error: Array
-    worst_time: Array
+    t: Array  # (M,), s
+    base: Array  # (K, M, base_size)
+    joints: Array  # within the limits, (K, M, joint_size)
+    rates: Array  # mean joint rates from each time to the next; the last ones are repeated, (K, M, joint_size)
+    cost: Array  # integral of half the weighted squared joint rates, (K,)
+    pose_error: Array  # largest one, m and rad; infinite if a motion diverges, (K,)
+    worst_time: Array  # time of the largest pose error, s, (K,)
 
     @classmethod
     def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Return motions that stay at given configurations.
-
-        Args:
-            times: Times. Shape (M,), s.
-            base, joints: Configurations. Shapes (K, base_size) and (K, joint_size).
-        """
+        """Return motions that stay at given configurations (K, base_size) and (K, joint_size)."""
         count, samples = len(joints), len(times)
         rates, zeros = np.zeros((count, samples, joints.shape[1])), np.zeros(count)
         bases, positions = (np.repeat(each[:, None], samples, axis=1) for each in (base, joints))
@@ -373,12 +346,9 @@ def track_tasks(
     lower: Array,
     upper: Array,
 ) -> LocalMotion:
-    """Track tasks from several start configurations by resolved-rate control.
+    """Track tasks from several start configurations (K, joint_size) and (K, base_size) by resolved-rate control.
 
     Args:
-        equations: Equations of the tasks.
-        joints: Joint positions at the first time. Shape (K, joint_size).
-        base: Base configurations at the first time. Shape (K, base_size).
         times: Increasing times, s. Shape (M,).
         weights: Weights of the squared joint rates. Shape (joint_size,).
         damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.
@@ -389,7 +359,7 @@ def track_tasks(
     b, q, u = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("u", machine.joint_size)
     motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
     pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
-    functions = [equations.function, *([_cone_function(equations)] if min_cosines.size else [])]
+    functions = [equations.function, *([equations.cone_function] if min_cosines.size else [])]
     symbols = [
         symbols_of(*functions).sym("input", size) for size in (machine.base_size, machine.joint_size, len(targets))
     ]
@@ -450,18 +420,6 @@ def track_tasks(
         errors_along.max(axis=1),
         times[worst],
     )
-
-
-def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) of the cosines of tool-axis tilts, and their gradients."""
-    machine = equations.machine
-    b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
-    targets = ca.SX.sym("targets", equations.target_function().numel_out())
-    cosines = equations.cone_cosines(b, q, targets)
-    slopes = ca.jacobian(cosines, q)
-    if machine.base_size:
-        slopes = slopes + ca.mtimes(ca.jacobian(cosines, b), ca.jacobian(machine.base_rate(b, q, u), u))
-    return ca.Function("leaning", [b, q, targets], [cosines, ca.densify(slopes)], {"cse": True})
 
 
 def _damped_rates(

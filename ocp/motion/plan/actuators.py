@@ -20,9 +20,9 @@ from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics import Actuation, checked_motors, joint_torques, running_cost, weights_torques
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, ToolMotion
-from ocp.motion.builders.torques import Actuation, checked_motors, joint_torques, running_cost, weights_torques
 from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.result.plan import CHECKED_TIMES
 from ocp.motion.result.request import declared_motion

@@ -14,7 +14,7 @@ from models.machines.standing import External
 from ocp.console import time_left
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup
+from ocp.motion.builders.dynamics import DynamicsSetup, checked_motors
 from ocp.motion.builders.dynamics_plan import (
     POINTS,
     SolveSettings,
@@ -27,7 +27,6 @@ from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.builders.standing.stances import Steps
-from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
 from ocp.motion.plan.goal_motions import GoalRequest

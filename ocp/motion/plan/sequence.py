@@ -23,8 +23,8 @@ from models import FixedBase, Machine
 from models.checks import Array, floats
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
+from ocp.motion.builders.dynamics import checked_motors
 from ocp.motion.builders.tool_motion import stretches_of
-from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators
 from ocp.motion.plan.declared_plans import plan_goal, with_joints

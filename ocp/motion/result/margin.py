@@ -29,7 +29,7 @@ from models.machines.standing import wrenches_at
 from ocp.audit.clearance import Clearance, clearance_of_pairs
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
-from ocp.motion.builders.torques import joint_torques
+from ocp.motion.builders.dynamics import joint_torques
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import CHECKED_TIMES, Plan
 from ocp.motion.result.request import RESERVE, request_of

@@ -44,7 +44,7 @@ from models.shapes.bodies import Body, LinkMesh
 from models.spatial import expression
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
+from ocp.motion.builders.dynamics import Actuation, DynamicsSetup, JointFriction, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of
 from ocp.motion.builders.joint_motion import joint_motion_problem
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp, capture_machines, capture_problem
@@ -52,7 +52,6 @@ from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weight
 from ocp.motion.builders.standing.stances import StancePhase, Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
-from ocp.motion.builders.torques import Actuation, JointFriction
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned

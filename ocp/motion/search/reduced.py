@@ -28,7 +28,7 @@ from ocp.motion.local.inverse_kinematics import Unreachable, gauss_newton, sampl
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
+from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -376,7 +376,7 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
     displacement = np.zeros(3)
     velocities = values[[task.chosen.index(row) for row in rows]]
     displacement[[row - 3 for row in rows]] = velocities @ weights * time / SIMPSON_STEPS / 3
-    origin, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
+    origin, _ = equations.bound[0].pose_in_reference(ca.DM(base), ca.DM(start))
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 

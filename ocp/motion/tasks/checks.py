@@ -16,42 +16,27 @@ from models import Joint, Machine
 from models.checks import Array, warn_of_degrees
 from ocp.errors import ProblemError, format_distinct, require
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_rows, target_size
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask
 
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Settings of the checks of tip tasks: numbers of samples and tolerances.
+    """Settings of the checks of tip tasks: numbers of samples and tolerances."""
 
-    Attributes:
-        track_samples: Number of samples of a track, a target over time.
-        closure_samples: Number of samples of a closed track: odd, for Simpson's rule.
-        closed: Largest gap of a closed path, m and rad.
-        ignorable: Relative change of the required joint rates below which a joint position counts as without effect.
-        ignorable_samples: Number of random configurations in which that is evaluated.
-        rounding: Tolerance of a joint limit, relative to the range between the limits; without one, to the limit, and
-            absolute (rad or m) for limits below 1.
-        still: Largest task velocity where the joints are to be at rest, m/s and rad/s.
-    """
-
-    track_samples: int = 201
-    closure_samples: int = 2001
-    closed: float = 1e-6
-    ignorable: float = 1e-9
-    ignorable_samples: int = 4
-    rounding: float = 1e-9
-    still: float = 1e-6
+    track_samples: int = 201  # of a track, a target over time
+    closure_samples: int = 2001  # of a closed track: odd, for Simpson's rule
+    closed: float = 1e-6  # largest gap of a closed path, m and rad
+    ignorable: float = 1e-9  # relative change of required joint rates below which a joint position has no effect
+    ignorable_samples: int = 4  # number of random configurations in which that is evaluated
+    rounding: float = 1e-9  # tolerance of a joint limit, per range between the limits or limit (at least 1)
+    still: float = 1e-6  # largest task velocity where the joints are to be at rest, m/s and rad/s
 
 
 CHECKS = CheckSettings()
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """Return the horizon (duration) of a motion, s; if `horizon` is None, this is the time at which the last task ends.
-
-    Raises:
-        ProblemError: The horizon is not positive, or it is None and no task has a duration.
-    """
+    """Return the horizon of a motion, s, by default the end of the last task; raise ProblemError if there is none."""
     if horizon is None:
         ends = [task.end for task in tasks if task.duration is not None]
         if not ends:
@@ -64,13 +49,10 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
     """Check the joint positions (joint_size,) and the base configuration (base_size,) of a start, and return both.
 
-    The base is by default the machine's base_home().
+    The base is by default the machine's base_home(). Warns of angles that look like degrees.
 
     Raises:
         ProblemError: Wrong sizes, a value that is not finite, or a quaternion that is not of unit length.
-
-    Warns:
-        ModelWarning: Angles that look like degrees.
     """
     if joints is None:
         words = "start is missing; give joint positions: inverse_kinematics(machine, task) finds some for a pose"
@@ -88,16 +70,10 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Clip joint positions or velocities (n,) to their limits, which rounding errors alone may have exceeded.
-
-    Args:
-        joints, lower, upper: Joint positions, or velocities, nan where free, and their limits. Shape (n,).
-        label: Name of the values in errors, for example "end_joints".
-        names: Names of the joints.
-        hint: End of the error message: what to do.
+    """Clip joint positions or velocities (n,), nan where free, to limits that rounding errors alone may have exceeded.
 
     Raises:
-        ProblemError: A joint is outside its limits by more than rounding.
+        ProblemError: A joint is outside its limits; `label` names the values, and `hint` says what to do.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
         size = high - low if np.isfinite(high - low) else max([1.0, *(abs(x) for x in (low, high) if np.isfinite(x))])
@@ -163,11 +139,11 @@ def checked_tasks(
             gap = float(np.abs(residual).max())
             if gap > part.task.start_gap:
                 words = (
-                    f"at the start joints {joints.tolist()} the frame of {_frame(part)!r} is {gap:.3g} (m or rad) away "
+                    f"at the start joints {joints.tolist()} the frame of {part.name!r} is {gap:.3g} (m or rad) away "
                     f"from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
                     "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
                 )
-                raise ProblemError(words, name=_frame(part), value=gap, limit=part.task.start_gap, time=0.0)
+                raise ProblemError(words, name=part.name, value=gap, limit=part.task.start_gap, time=0.0)
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
@@ -179,14 +155,14 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints' positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
+    """Return which joints' positions affect neither the required joint rates nor the base motion. Shape (n,).
 
-    Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
-    and the cones of tool axes do not depend on such a joint position.
+    That is evaluated in random configurations: the rates that do the tasks, the null space, the base motion and the
+    cones of tool axes do not depend on such a joint position.
     """
     machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
-    targets = ca.SX.sym("targets", sum(target_size(value.task) for value in equations.bound))
+    targets = ca.SX.sym("targets", equations.target_size)
     parts = [equations.jacobian(b, q), equations.right(b, q, targets)]
     parts += [machine.base_rate(b, q, u), equations.cone_cosines(b, q, targets)]
     function = ca.Function("requirements", [b, q, u, targets], parts, {"cse": True})
@@ -213,11 +189,6 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
     return list(range(equations.size))
 
 
-def _frame(part: BoundTask) -> str:
-    """Return the name of the link whose frame a task moves."""
-    return part.task.link or part.tip.robot.tip_link
-
-
 def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
     """Sample the targets of all tasks at `count` equidistant times from 0 to the horizon; return times and samples."""
     times = np.linspace(0.0, horizon, count)
@@ -228,7 +199,7 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
     """Raise ProblemError if a target orientation is not a rotation matrix at one of the times."""
     for part, targets in equations.by_task(values):
         if part.task.orientation is not None:
-            rotations = targets[target_rows(part.task)["orientation"][0]].T.reshape(-1, 3, 3)
+            rotations = targets[part.target_rows["orientation"][0]].T.reshape(-1, 3, 3)
             invalid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
             invalid |= np.linalg.det(rotations) < 0
             if invalid.any():
@@ -246,17 +217,14 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target of a task does not return to its start, as a cyclic motion requires.
-
-    Poses are checked by their targets, velocities by their integrals.
-    """
+    """Raise ProblemError if the target of a task (of a velocity: its integral) does not return to its start."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in equations.by_task(values):
         task = part.task
         if task.is_pose:
-            gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], _rate_rows(task))).max()
+            gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], part.rate_rows)).max()
         else:
-            holonomic = is_holonomic(part)
+            holonomic = part.is_holonomic
             by_row, zeros = dict(zip(task.chosen, targets, strict=True)), np.zeros(CHECKS.closure_samples)
             angular = [by_row.get(row, zeros) for row in ANGULAR]
             linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and holonomic[i]]
@@ -266,10 +234,10 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
             gap = max(float(np.abs(displacement).max(initial=0.0)), rotation)
         if gap > CHECKS.closed:
             words = (
-                f"cyclic: the task of {_frame(part)!r} is not closed: it ends {gap:.3g} (m or rad) "
+                f"cyclic: the task of {part.name!r} is not closed: it ends {gap:.3g} (m or rad) "
                 "from where it began, and the joints cannot return; close the path"
             )
-            raise ProblemError(words, name=_frame(part), value=gap, limit=CHECKS.closed)
+            raise ProblemError(words, name=part.name, value=gap, limit=CHECKS.closed)
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
@@ -277,10 +245,10 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = (
-                f"the task of {_frame(part)!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
+                f"the task of {part.name!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
                 "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
             )
-            raise ProblemError(words, name=_frame(part), value=velocity, limit=CHECKS.still, time=float(time))
+            raise ProblemError(words, name=part.name, value=velocity, limit=CHECKS.still, time=float(time))
 
 
 def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
@@ -291,7 +259,7 @@ def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
 def _moving_tasks(equations: TaskEquations, time: float) -> Iterator[tuple[BoundTask, Array]]:
     """Yield the tasks that prescribe motion at a time, and the velocities that they prescribe, m/s and rad/s."""
     for part, values in equations.by_task(np.array(equations.target_function()(time)).ravel()):
-        velocity = values[_rate_rows(part.task)] if part.task.is_pose else values
+        velocity = values[part.rate_rows] if part.task.is_pose else values
         if np.linalg.norm(velocity) > CHECKS.still:
             yield part, velocity
 
@@ -309,21 +277,16 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         worst = int(far.argmax())
         if far[worst] > reach:
             words = (
-                f"the task of {_frame(part)!r} leads {far[worst]:.4g} m away from the first joint at "
+                f"the task of {part.name!r} leads {far[worst]:.4g} m away from the first joint at "
                 f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             )
-            raise ProblemError(words, name=_frame(part), value=float(far[worst]), limit=reach, time=float(times[worst]))
+            raise ProblemError(words, name=part.name, value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than the joint rate limits permit the tip to move in any configuration.
+    """Raise ProblemError if a task is faster than rate limits (n,) permit the tip of a fixed arm to move anywhere.
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
-
-    Args:
-        equations: Equations of the tasks; those on a floating base are not checked.
-        rate_limits: Limits of the joint rates, rad/s or m/s. Shape (n,).
-        begin, end: Time interval of the tasks, s.
     """
     times = np.linspace(begin, end, CHECKS.track_samples)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
@@ -338,11 +301,11 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
             worst = int(speeds.argmax())
             if speeds[worst] > limit * (1 + CHECKS.closed):
                 words = (
-                    f"at {times[worst]:.4g} s the task of {_frame(part)!r} asks for {speeds[worst]:.4g} {unit}, "
+                    f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, "
                     f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
                 )
                 details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
-                raise ProblemError(words, name=_frame(part), **details)
+                raise ProblemError(words, name=part.name, **details)
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
@@ -390,16 +353,8 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
     return shoulder, slide_length + _chain_length(machine, chain[first + 1 :])
 
 
-def _rate_rows(task: TipTask) -> list[int]:
-    """Return the indices of the velocities and angular velocities among the target values of a pose task."""
-    return [row for _, rates in target_rows(task).values() for row in range(rates.start, rates.stop)]
-
-
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that results from a sampled angular velocity (3, samples) in world.
-
-    A fourth-order Magnus expansion integrates two steps at a time.
-    """
+    """Return the angle, rad, of the rotation by sampled angular velocities (3, samples) in world (Magnus expansion)."""
     first, middle, last = velocity[:, :-2:2], velocity[:, 1:-1:2], velocity[:, 2::2]
     vectors = step / 3 * (first + 4 * middle + last) + step**2 / 3 * np.cross(last, first, axis=0)
     turns = scipy.spatial.transform.Rotation.from_rotvec(vectors.T)
@@ -409,14 +364,9 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
     """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for as many joints as tasks fix there.
 
-    A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
-    rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip
-    most are left free.
-
-    Args:
-        equations: Equations of the tasks.
-        base, joints: Configuration near that end.
-        rows: Which rows of the tasks come to rest by themselves; all if None. Shape (size,).
+    A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
+    joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task
+    equations that come to rest by themselves; all if None.
     """
     rest = np.zeros(len(joints))
     jacobian = np.array(ca.DM(equations.jacobian(ca.DM(base), joints)))

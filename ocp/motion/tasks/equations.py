@@ -7,7 +7,7 @@ targets; everything else is a function of configuration and targets, written ele
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,33 +16,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FixedBase, FreeFloating, Machine, ModelError, Robot, Standing
+from models import FixedBase, FreeFloating, Machine, Robot, Standing
 from models.checks import Array
 from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
-from models.spatial import on_scalars
-from ocp.errors import ProblemError, require
-from ocp.motion.tasks.tip_task import (
-    ANGULAR,
-    BoundTask,
-    TipTask,
-    angular_velocity,
-    closing_combinations,
-    cross_product,
-    derivative,
-    is_holonomic,
-    movable_angular_rows,
-    pose_error,
-    pose_error_rows,
-    pose_in_reference,
-    reference_pose,
-    relative_twist,
-    rotation_of,
-    split_targets,
-    target_size,
-    target_twist,
-    task_rows,
-)
+from models.spatial import on_scalars, rotation_from_quaternion
+from ocp.errors import ProblemError, problem_errors, require
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, closing_combinations, cross_product
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
 
@@ -64,16 +44,22 @@ class TaskEquations:
         return sum(part.task.size for part in self.bound)
 
     @property
+    def target_size(self) -> int:
+        """Number of values in the column of targets of all tasks."""
+        return sum(part.target_size for part in self.bound)
+
+    def by_row(self, value_of: Callable[[TipTask], Any]) -> Array:
+        """Return a value of each task, repeated for each of its equations. Shape (size, ...)."""
+        return np.repeat([value_of(part.task) for part in self.bound], [part.task.size for part in self.bound], axis=0)
+
+    @property
     def pose_rows(self) -> NDArray[np.bool_]:
         """Mask of the task equations that belong to pose tasks, not to velocity tasks. Shape (size,), bool."""
-        return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
+        return np.asarray(self.by_row(lambda task: task.is_pose), dtype=bool)
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints that move neither the frame nor the reference frame of any task. Shape (joint_size,).
-
-        On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
-        """
+        """Mask of the joints, (n,), that move no frame or reference of a task; none if they move a base or balance."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
@@ -82,12 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text, for example "rad/s, m/s" for the velocity residual.
-
-        Args:
-            pose, velocity: Time units of the rows of pose and of velocity tasks: "" for `error`, "/s^2" for
-                `acceleration`.
-        """
+        """Return the units of the task equations as text, with given time units of pose and of velocity tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []
@@ -99,53 +80,53 @@ class TaskEquations:
         """Return the targets of all tasks (poses and velocities) as a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
-        rotation and angular velocity (9, 3), direction and angular velocity (3, 3).
-
-        Args:
-            time: Symbol that the tracks are functions of: the time, s, or a path parameter.
-            pace: Rate of a path parameter, 1/s.
-
-        Raises:
-            ProblemError: A track has a wrong size, is not finite, or depends on anything but the time.
+        rotation and angular velocity (9, 3), direction and angular velocity (3, 3). If `time` is a path parameter,
+        `pace` is its rate, 1/s. Raises ProblemError if a track is invalid, see `track_expression`.
         """
         parts = []
         for task in (part.task for part in self.bound):
+
+            def expression_of(name: str, *shapes: tuple[int, int], rate: bool = False, task: TipTask = task) -> Any:
+                track, words = getattr(task, name), f"{name} rate" if rate else name
+                return track_expression(track.rate if rate else track, time, shapes, what=words, begin=task.begin)
+
             if task.velocity is not None:
-                parts.append(
-                    pace * track_expression(task.velocity, time, (task.size, 1), what="velocity", begin=task.begin)
-                )
+                parts.append(pace * expression_of("velocity", (task.size, 1)))
             if task.position is not None:
-                value = _position_of(task, task.position, time, "position")
-                rate = getattr(task.position, "rate", None)
-                velocity = derivative(value, time) if rate is None else _position_of(task, rate, time, "position rate")
+                short = task.along_reference and len(task.linear) < 3
+                shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
+                value = _whole(task, expression_of("position", *shapes))
+                if hasattr(task.position, "rate"):
+                    velocity = _whole(task, expression_of("position", *shapes, rate=True))
+                else:
+                    velocity = _derivative(value, time)
                 parts += [value, pace * velocity]
             if task.orientation is not None:
-                value = track_expression(task.orientation, time, ((4, 1), (3, 3)), what="orientation", begin=task.begin)
-                rotation = rotation_of(value) if value.shape == (4, 1) else value
-                rate = getattr(task.orientation, "rate", None)
-                if rate is None:
-                    angular = angular_velocity(rotation, ca.reshape(derivative(ca.vec(rotation), time), 3, 3))
+                value = expression_of("orientation", (4, 1), (3, 3))
+                rotation = _rotation_of(value) if value.shape == (4, 1) else value
+                if hasattr(task.orientation, "rate"):
+                    angular = expression_of("orientation", (3, 1), rate=True)
                 else:
-                    angular = track_expression(rate, time, (3, 1), what="orientation rate", begin=task.begin)
+                    angular = _angular_velocity(rotation, ca.reshape(_derivative(ca.vec(rotation), time), 3, 3))
                 parts += [ca.vec(rotation), pace * angular]
             if task.direction is not None:
-                value = track_expression(task.direction, time, (3, 1), what="direction", begin=task.begin)
+                value = expression_of("direction", (3, 1))
                 length = ca.norm_2(value)
-                unit, rate = value / length, getattr(task.direction, "rate", None)
-                if rate is None:
-                    unit_rate = derivative(unit, time)
+                unit = value / length
+                if hasattr(task.direction, "rate"):
+                    unit_rate = expression_of("direction", (3, 1), rate=True) / length
                 else:
-                    unit_rate = track_expression(rate, time, (3, 1), what="direction rate", begin=task.begin) / length
+                    unit_rate = _derivative(unit, time)
                 parts += [unit, pace * cross_product(unit, unit_rate)]
         return ca.densify(ca.vertcat(*parts))
 
     @on_scalars
     def jacobian(self, base: Any, joints: Any) -> Any:
         """Return the Jacobian J of all tasks with respect to the joint rates u. Shape (size, joint_size)."""
-        rows = []
-        for part in self.bound:
-            columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), rates=None)
-            rows.append(task_rows(part, base, joints, columns))
+        rows = [
+            part.rows(base, joints, part.relative(base, joints, lambda machine: machine.tip_jacobian(base, joints)))
+            for part in self.bound
+        ]
         symbolic = isinstance(base, ca.SX) or isinstance(joints, ca.SX)
         return ca.densify(ca.cse(ca.vertcat(*rows)) if symbolic else ca.vertcat(*rows))
 
@@ -159,32 +140,28 @@ class TaskEquations:
         """Return the residual J u - b of the task equation at joint rates u. Shape (size, 1)."""
         rows = []
         for part, target in self.by_task(targets):
-            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
-            if part.task.velocity is not None:
-                rows.append(task_rows(part, base, joints, twist) - target)
+            twist = part.twist(base, joints, rates)
+            if part.task.is_pose:
+                rows.append(part.rows(base, joints, twist - part.target_twist(base, joints, target)))
             else:
-                rows.append(task_rows(part, base, joints, twist - target_twist(part, base, joints, target)))
+                rows.append(part.rows(base, joints, twist) - target)
         return ca.densify(ca.vertcat(*rows))
 
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
         """Return the tip velocities in the components that the tasks prescribe, rad/s and m/s. Shape (size, 1)."""
-        rows = []
-        for part in self.bound:
-            twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
-            rows.append(task_rows(part, base, joints, twist))
-        return ca.densify(ca.vertcat(*rows))
+        return ca.densify(
+            ca.vertcat(*[part.rows(base, joints, part.twist(base, joints, rates)) for part in self.bound])
+        )
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
         """Return the deviations of the tips from their tasks by name, each as arguments of `Problem.watch`.
 
-        For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
-        residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
-        enforced at velocity or acceleration level, errors too small for that equation may accumulate. A pose may
-        deviate by the start gap of its task, which the feedback closes, and by the tolerance of its task.
+        For poses these are their errors, for velocities the integral of their residual; each is judged relative to the
+        path of the tips. A pose may deviate by the start gap of its task, which the feedback closes, and by its
+        tolerance.
         """
-        tolerances = self.tolerances
-        gaps = np.repeat([part.task.start_gap for part in self.bound], [part.task.size for part in self.bound])
+        tolerances, gaps = self.tolerances, self.by_row(lambda task: task.start_gap)
         gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default gap is not closed
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         twist, deviations = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
@@ -206,8 +183,7 @@ class TaskEquations:
     @property
     def tolerances(self) -> Array:
         """Accepted pose error of each task equation, m or rad. Shape (size,)."""
-        pairs = np.repeat([part.task.tolerance for part in self.bound], [part.task.size for part in self.bound], axis=0)
-        return np.asarray(np.where(self.turning, *pairs.T[::-1]))
+        return np.asarray(np.where(self.turning, *self.by_row(lambda task: task.tolerance).T[::-1]))
 
     @property
     def turning(self) -> NDArray[np.bool_]:
@@ -218,15 +194,10 @@ class TaskEquations:
         return np.array(angular, dtype=bool)
 
     def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
-        """Return the residual of the task equations for joint accelerations, including pose feedback. Shape (size, 1).
+        """Return the residual of the task equations for joint accelerations u', (n, 1), with feedback. Shape (size, 1).
 
-        d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
-
-        Args:
-            base, joints, rates: Symbols.
-            second: Joint accelerations u', (joint_size, 1).
-            progress: The time, as for `targets`; or a path parameter, its pace, which is a symbol too, and the rate of
-                the pace, 1/s^2.
+        d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0. `progress` is the
+        symbol of the time; or a path parameter, its pace, which is a symbol too, and the rate of the pace, 1/s^2.
         """
         time, pace, change = progress if len(progress) > 1 else (progress[0], 1, 0)
         residual = self.residual(base, joints, rates, self.targets(time, pace))
@@ -235,8 +206,8 @@ class TaskEquations:
             symbols, rates_of = [base, *symbols], [self.machine.base_rate(base, joints, rates), *rates_of]
         if isinstance(pace, ca.SX | ca.MX):
             symbols, rates_of = [*symbols, pace], [*rates_of[:-1], pace, change]
-        gains = np.repeat([float(part.task.gain) for part in self.bound], [part.task.size for part in self.bound])
-        return ca.jtimes(residual, ca.vertcat(*symbols), ca.vertcat(*rates_of)) + ca.sparsify(ca.DM(gains)) * residual
+        gains = ca.sparsify(ca.DM(self.by_row(lambda task: float(task.gain))))
+        return ca.jtimes(residual, ca.vertcat(*symbols), ca.vertcat(*rates_of)) + gains * residual
 
     @on_scalars
     def manipulability(self, base: Any, joints: Any) -> Any:
@@ -248,10 +219,10 @@ class TaskEquations:
         """Return the pose errors (target minus pose) of all tasks, m and rad; 0 for velocity tasks. Shape (size, 1)."""
         rows = []
         for part, target in self.by_task(targets):
-            if part.task.velocity is not None:
-                rows.append(ca.DM(part.task.size, 1))
+            if part.task.is_pose:
+                rows.append(part.rows(base, joints, part.pose_error(base, joints, target)))
             else:
-                rows.append(task_rows(part, base, joints, pose_error(part, base, joints, target)))
+                rows.append(ca.DM(part.task.size, 1))
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
@@ -261,38 +232,36 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors (m, near zero rad) that does not vanish at a rotation error of half a turn.
+        """Return a column of pose errors, m and chords of the unit circle, not zero at a rotation error of half a turn.
 
-        In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
-        prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
-        vector. Velocity tasks have no entries.
+        If all rotation is prescribed, the chords (2 sin(angle / 2), near zero the angle in rad) are the differences of
+        the frame axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries.
         """
         rows: list[Any] = [ca.DM(0, 1)]
         for part, target in self.by_task(targets):
             task = part.task
             if not task.is_pose:
                 continue
-            position_target, rotation_target = split_targets(task, target)
-            reference = reference_pose(part, base, joints)
+            position_target, rotation_target = part.split_targets(target)
             rotation = part.tip.tip_pose(base, joints).rotation
-            error = pose_error(part, base, joints, target)
+            error = part.pose_error(base, joints, target)
             if rotation_target is not None:
-                goal = rotation_target[0] if reference is None else ca.mtimes(reference.rotation, rotation_target[0])
+                goal = ca.mtimes(part.reference_pose(base, joints).rotation, rotation_target[0])
                 if task.within is not None:
-                    rows.append(ca.fmax(float(np.cos(task.within)) - self._cosine(part, base, joints, target), 0))
+                    rows.append(ca.fmax(float(np.cos(task.within)) - part.cone_cosine(base, joints, target), 0))
                 elif task.direction is not None:
                     rows.append(goal - ca.mtimes(rotation, ca.DM(task.tool_axis)))
-                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(movable_angular_rows(part)):
+                elif set(task.chosen) >= set(ANGULAR) or set(task.chosen) >= set(part.movable_angular_rows):
                     rows.append(ca.vec(goal - rotation) / np.sqrt(2))
                 else:
                     cosine = (ca.trace(ca.mtimes(goal, rotation.T)) - 1) / 2
                     half = error[0:3] * ca.sqrt(2 / (1 + ca.fmax(cosine, -1 + 1e-9)))
                     angular = [i for i, row in enumerate(task.chosen) if row in ANGULAR]
-                    rows.append(task_rows(part, base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
+                    rows.append(part.rows(base, joints, ca.vertcat(half, ca.DM(3, 1)))[angular])
             if position_target is not None:
                 tilt = 2 if task.tilts else 0
                 linear = [tilt + i for i, row in enumerate(task.chosen) if row not in ANGULAR]
-                rows.append(task_rows(part, base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
+                rows.append(part.rows(base, joints, ca.vertcat(ca.DM(3, 1), error[3:6]))[linear])
         return ca.densify(ca.vertcat(*rows))
 
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
@@ -316,47 +285,31 @@ class TaskEquations:
     @on_scalars
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the cosine of the angle between tool axis and cone axis for each task with a cone. Shape (k, 1)."""
-        rows: list[Any] = [ca.DM(0, 1)]
-        for part, target in self.by_task(targets):
-            if part.task.within is not None:
-                rows.append(self._cosine(part, base, joints, target))
-        return ca.densify(ca.vertcat(*rows))
+        cones = [(part, target) for part, target in self.by_task(targets) if part.task.within is not None]
+        return ca.densify(ca.vertcat(ca.DM(0, 1), *[part.cone_cosine(base, joints, target) for part, target in cones]))
 
     @property
     def cone_angles(self) -> Array:
         """Half-angles, rad, of the cones in which tool axes must stay, one for each task with a cone. Shape (k,)."""
         return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
 
-    def _cosine(self, part: BoundTask, base: Any, joints: Any, target: Any) -> Any:
-        """Return the cosine of the angle between the tool axis of a task and the target direction of the task."""
-        _, direction = split_targets(part.task, target)
-        reference = reference_pose(part, base, joints)
-        goal = direction[0] if reference is None else ca.mtimes(reference.rotation, direction[0])
-        return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
-
+    @on_scalars
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the differences of the tip poses of velocity tasks between a configuration and a reference one.
-
-        For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
-        """
+        """Return the pose errors (rows, 1) of the tips of velocity tasks from those in a reference configuration."""
         rows: list[Any] = [ca.DM(0, 1)]
-        for part in self.bound:
-            if part.task.velocity is not None:
-                position, rotation = (ca.DM(value) for value in pose_in_reference(part, at_base, at_joints))
-                bound = part._replace(
-                    task=replace(part.task, velocity=None, position=np.zeros(3), orientation=np.eye(3))
-                )
-                targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(rotation), ca.DM(3, 1))
-                rows.append(pose_error_rows(bound, base, joints, targets))
+        for part in (part for part in self.bound if not part.task.is_pose):
+            position, rotation = (ca.DM(value) for value in part.pose_in_reference(at_base, at_joints))
+            pose = part._replace(task=replace(part.task, velocity=None, position=np.zeros(3), orientation=np.eye(3)))
+            targets = ca.vertcat(position, ca.DM(3, 1), ca.vec(rotation), ca.DM(3, 1))
+            rows.append(pose.rows(base, joints, pose.pose_error(base, joints, targets)))
         return ca.vertcat(*rows)
 
     def by_task(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
         """Yield each task together with the task's own rows of the stacked targets of all tasks."""
         at = 0
         for part in self.bound:
-            size = target_size(part.task)
-            yield part, targets[at : at + size]
-            at += size
+            yield part, targets[at : at + part.target_size]
+            at += part.target_size
 
     def errors(self, t: Any, base: Any, joints: Any) -> Array:
         """Return the pose errors of all tasks along a motion, m and rad; 0 for velocity tasks. Shape (M, size)."""
@@ -375,20 +328,23 @@ class TaskEquations:
         bases, positions, targets = self._along(t, base, joints)
         if not self.cone_angles.size:
             return np.zeros((len(positions), 0))
-        cosines = np.array(self._cone_function.map(len(positions))(bases.T, positions.T, targets)).T
+        cosines = np.array(self.cone_function.map(len(positions))(bases.T, positions.T, targets)[0]).T
         return np.asarray(np.maximum(np.arccos(np.clip(cosines, -1.0, 1.0)) - self.cone_angles, 0.0))
 
     @cached_property
-    def _cone_function(self) -> Any:
-        symbols = self._symbols
-        return ca.Function("cone_cosines", symbols, [self.cone_cosines(*symbols)], {"cse": True})
+    def cone_function(self) -> Any:
+        """CasADi Function (base, joints, targets) -> (`cone_cosines`, their gradients in the joint rates)."""
+        base, joints, targets = self._symbols
+        cosines, rates = self.cone_cosines(base, joints, targets), ca.SX.sym("rates", self.machine.joint_size)
+        slopes = ca.jacobian(cosines, joints)
+        if self.machine.base_size:
+            motion = ca.jacobian(self.machine.base_rate(base, joints, rates), rates)
+            slopes += ca.mtimes(ca.jacobian(cosines, base), motion)
+        return ca.Function("cones", [base, joints, targets], [cosines, ca.densify(slopes)], {"cse": True})
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function of configuration and targets: task matrix J, right-hand side b and pose errors.
-
-        (base, joints, targets) -> (J, b, pose error, pose residual).
-        """
+        """CasADi Function (base, joints, targets) -> (J, b, pose error, pose residual)."""
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
@@ -410,8 +366,7 @@ class TaskEquations:
     @property
     def _symbols(self) -> tuple[Any, ...]:
         """CasADi symbols for the base configuration, the joint positions and the targets."""
-        targets = sum(target_size(part.task) for part in self.bound)
-        sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": targets}
+        sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": self.target_size}
         return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
     def target_function(self) -> Any:
@@ -426,14 +381,13 @@ class TaskEquations:
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
         """Return the combinations of task equations whose integral vanishes over a cyclic motion. Shape (size, k).
 
-        If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
-        fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
-        of mass stays. Rows whose integral depends on the path do not count.
+        Closure follows from all holonomic rows on a fixed base; on a floating base from the combinations of rows that
+        are independent of the base pose while the centre of mass stays.
 
         Raises:
             ProblemError: The momentum moves the centre of mass, and the joints cannot return.
         """
-        holonomic = np.concatenate([is_holonomic(part) for part in self.bound])
+        holonomic = np.concatenate([part.is_holonomic for part in self.bound])
         directions = np.eye(self.size)[:, holonomic]
         if self.machine.base_size == 0:
             return directions
@@ -442,16 +396,31 @@ class TaskEquations:
         return directions @ closing_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
 
 
-def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
+def _whole(task: TipTask, value: Any) -> Any:
     """Return a position target with all three coordinates; a coordinate that is not prescribed is 0. Shape (3, 1)."""
-    short = task.along_reference and len(task.linear) < 3
-    shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
-    value = track_expression(track, time, shapes, what=name, begin=task.begin)
     if value.shape[0] == 3:
         return value
     whole = type(value)(3, 1)
     whole[task.linear] = value
     return ca.densify(whole)
+
+
+def _derivative(value: Any, time: Any) -> Any:
+    """Return the time derivative of an expression as a dense matrix, zero for a constant."""
+    return ca.densify(ca.jacobian(value, time)) if isinstance(value, ca.SX | ca.MX) else ca.DM.zeros(*value.shape)
+
+
+@on_scalars
+def _rotation_of(quaternion: Any) -> Any:
+    """Return the rotation matrix of a quaternion, computed on scalar symbols."""
+    return rotation_from_quaternion(quaternion)
+
+
+@on_scalars
+def _angular_velocity(rotation: Any, rate: Any) -> Any:
+    """Return the angular velocity in world axes from a rotation matrix and its derivative. Shape (3, 1)."""
+    spin = ca.mtimes(rate, rotation.T)
+    return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
@@ -471,12 +440,10 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
         raise ProblemError("task is an empty list; give a TipTask, or several", name="task", value=listed)
     bound = []
     for task in listed:
-        try:
+        with problem_errors():
             tip = with_tip(machine, task.link, task.point) if task.link is not None else machine
             _ = tip.robot.tip_link
             reference = None if task.relative_to is None else with_tip(machine, task.relative_to)
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
         bound.append(BoundTask(task, tip, reference))
     return TaskEquations(bound[0].tip if machine.robot.tip is None else machine, tuple(bound))
 
@@ -484,14 +451,5 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
 def task_errors(
     machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, joints: Any, *, base: Any = None
 ) -> Array:
-    """Return the pose errors of tasks along a motion, m and rad; 0 for velocity tasks. Shape (M, size).
-
-    Args:
-        t: Times, s. Shape (M,).
-        joints: Joint positions. Shape (M, joint_size).
-        base: Base configurations. Shape (M, base_size), or None on a fixed base.
-
-    Returns:
-        Shape (M, rows of all tasks).
-    """
+    """Return the pose errors of tasks at times (M,) of a motion, m and rad; 0 for velocities. Shape (M, rows)."""
     return bind(machine, tasks).errors(t, base, joints)

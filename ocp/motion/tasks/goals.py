@@ -33,10 +33,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a value as (Start, joint positions of shape (n,) or None if free, base configuration), all checked.
-
-        Args:
-            value: A start, joint positions, or None.
+        """Return a start, joint positions or None as (Start, joint positions (n,) or None if free, base configuration).
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -48,10 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a value as (Start, joint positions of shape (n,), base configuration); no position may be free.
-
-        Args:
-            value: A start with joint positions, or joint positions.
+        """Return a start or joint positions as (Start, joint positions (n,), base configuration); none may be free.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.
@@ -185,14 +179,13 @@ class Cost:
     with duration T, joint positions q, joint torques tau and angular velocity omega of the base.
 
     Attributes:
-        velocity: Weight of half the squared joint velocities.
+        velocity, jerk: Weights of half the squared joint velocities, and of the squared jerks.
         time: Weight of the duration, 1/s.
         effort: Weight of the squared torques (losses in the windings), one number or one for each joint, 1/(N m)^2/s.
         length: Weight of the length of the joint path, 1/rad.
         energy: Weight of the positive actuator work, 1/J. Braking regains nothing.
         acceleration: Weight of the squared accelerations, one number or one for each joint. It matters for light joints
             at the end of an arm, which need hardly any torque.
-        jerk: Weight of the squared jerks.
         turning: Weight of the squared angular velocity of a floating base, 1/(rad/s)^2/s.
         weights: Weights w of the joints in the velocity and the length, positive, shape (n,); all 1 if None.
 
@@ -234,11 +227,7 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the weights of the squared joint velocities: `velocity` times the weight of each joint. Shape (size,).
-
-        Raises:
-            ProblemError: The number of weights is not the number of joints, or a weight is not positive.
-        """
+        """Return the checked weights (size,) of the squared joint velocities: `velocity` times those of the joints."""
         return self.velocity * checked_weights(self.weights, size)
 
     def __repr__(self) -> str:

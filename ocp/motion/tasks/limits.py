@@ -16,9 +16,7 @@ from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import expression
 from ocp.errors import ProblemError, require
 
-PARALLEL = 1e-12
-"""Cosine between a direction and the normal of a support edge below which the edge counts as parallel to the direction.
-"""
+PARALLEL = 1e-12  # cosine to the normal of a support edge below which a direction counts as parallel to the edge
 
 ROUNDING_M = 1e-9
 REFERENCE_SAMPLES = 201  # number of times at which a reference is checked
@@ -36,9 +34,7 @@ class InFoot:
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (is_finite(self.margin) and self.margin >= 0):
-            words = f"InFoot: margin must be a finite number of m, not negative, not {self.margin!r}"
-            raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
+        require.nonnegative("InFoot: margin", self.margin, unit="m")
 
     def check(self, machine: Standing) -> None:
         """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""
@@ -126,10 +122,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges that must become constraints for a zero moment point rule; a margin moves them inwards.
-
-    Returns:
-        Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
+    """Return the support edges that a zero moment point rule turns into constraints: inward normals n (k, 2) and
+    offsets o (k,), n . point >= o; a margin moves them inwards.
     """
     normals = machine.support.normals
     offsets = (normals * machine.support.vertices).sum(axis=1)
@@ -146,15 +140,8 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances of the zero moment point from the support edges, if motions change them. Shape (k, 1), m.
-
-    Args:
-        machine, zmp: The machine and the rule for its zero moment point.
-        point: The zero moment point of the motion. Shape (2, 1).
-        external: Whether there are external wrenches, which may move the point in any direction.
-
-    Raises:
-        ProblemError: The point is beyond an edge in every motion.
+    """Return the distances of a zero moment point (2, 1) from the support edges, where motions (with `external`
+    wrenches, any) change them, (k, 1), m; raise ProblemError if it is beyond an edge in every motion.
     """
     normals, offsets = foot_edges(machine, zmp)
     movable = np.abs(normals @ machine.moving_directions.T).max(axis=1, initial=0.0) > PARALLEL
@@ -173,13 +160,8 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return along which axes (0: x, 1: y) motions move the zero moment point out of a rule's rectangle.
-
-    Args:
-        machine, zmp, point, external: As for foot_rows.
-
-    Raises:
-        ProblemError: A coordinate that no motion moves is outside the region.
+    """Return along which axes (0: x, 1: y) motions move the zero moment point out of a rule's rectangle; raise
+    ProblemError if a coordinate that no motion moves is outside it.
     """
     rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
     low, high = zmp.region(machine)
@@ -223,14 +205,8 @@ LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
 
 
 class JointBounds(NamedTuple):
-    """Limits of position, velocity, acceleration, jerk, torque and power of each joint, in SI units. Shape (n,) each.
-
-    A limit is infinite if there is none.
-
-    Attributes:
-        lower, upper: Position limits.
-        velocity, acceleration, jerk, torque: Largest absolute values.
-        power: Largest power that an actuator delivers.
+    """Limits of each joint, in SI units, infinite where there is none: position, and largest absolute values of
+    velocity, acceleration, jerk and torque, and largest power that an actuator delivers. Shape (n,) each.
     """
 
     lower: Array
@@ -300,15 +276,10 @@ class Limits:
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
         """Return the joint limits of a machine; limits that the robot description lacks are infinite.
 
-        Args:
-            machine: The machine.
-            used: Kinds of limits, "velocity" or "torque", to warn about if the robot gives 0 for them.
+        Warns of `used` kinds of limits, "velocity" or "torque", that are not set here and 0 in the robot description.
 
         Raises:
             ProblemError: A limit is neither one number nor one number for each joint.
-
-        Warns:
-            ModelWarning: A used limit is not set here and 0 in the robot description, so that the joints are unlimited.
         """
         if self.robust is not None:
             words = "limits: robust is taken by plan alone; leave it out here, and see Plan.margin"

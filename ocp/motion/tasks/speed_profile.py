@@ -20,18 +20,11 @@ from models.checks import Array, short_repr
 from ocp.errors import ProblemError, require, values_within
 from ocp.tolerances import ROUNDING_SHARE
 
-Phases = tuple[tuple[float, float], ...]
-"""Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
+Phases = tuple[tuple[float, float], ...]  # durations (s) and jerks (m/s^3) of consecutive phases of constant jerk
 
 
 class LineMotion(NamedTuple):
-    """Motion along a path at M times: distance covered, speed, acceleration and jerk.
-
-    Attributes:
-        t: Time. Shape (M,), s.
-        distance: Distance along the path. Shape (M,), m.
-        speed, acceleration, jerk: Time derivatives of the distance. Shape (M,), m/s, m/s^2, m/s^3.
-    """
+    """Motion along a path at M times: distance covered and its derivatives, in s and m. Shape (M,) each."""
 
     t: Array
     distance: Array
@@ -50,10 +43,7 @@ def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple
 
 
 def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
-    """Return the index of the interval between increasing bounds (K + 1,) that contains each position.
-
-    `side` chooses the interval at a bound; places beyond the ends belong to the first and last interval.
-    """
+    """Return the index of the interval of increasing bounds (K + 1,) that contains each place, or that is nearest."""
     return np.asarray(np.clip(np.searchsorted(bounds, places, side=side) - 1, 0, len(np.asarray(bounds)) - 2))
 
 
@@ -90,11 +80,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, return the value after the jump.
-
-        Raises:
-            ProblemError: A time is nan, or outside by more than rounding.
-        """
+        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, that after the jump."""
         words = f"s is outside the schedule, 0 to {self.duration:g} s"
         t = np.atleast_1d(values_within(time, self.duration, "time", words))
         segment = segment_index(self.t, t)
@@ -105,11 +91,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; where the motion rests, return its state on arrival.
-
-        Raises:
-            ProblemError: A distance is nan, or off the path by more than rounding.
-        """
+        """Return the motion at distances (M,) from the start, m; where the motion rests, that on arrival."""
         length = float(self.distance[-1])
         words = f"m is off the path, which is {length:g} m long"
         s = np.atleast_1d(values_within(distance, length, "distance", words))
@@ -126,10 +108,7 @@ class SpeedProfile:
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return the motion as a CasADi Function from time (s) to distance, speed, acceleration and jerk.
-
-        Its tables are MX constants. Times outside are clipped to the ends.
-        """
+        """Return a CasADi Function from time (s), clipped, to distance, speed, acceleration and jerk."""
         time = ca.MX.sym("time")
         inside = ca.fmin(ca.fmax(time, 0.0), self.duration)
         table = np.stack([self.t[:-1], self.distance[:-1], self.speed[:-1], self.acceleration[:-1], self.jerk])
@@ -176,14 +155,10 @@ class SpeedProfile:
 
 
 def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
-    """Return the speed profile through given nodes, with two segments of constant jerk between neighbouring nodes.
+    """Return the speed profile through nodes (N + 1,), with two segments of constant jerk between neighbouring nodes.
 
-    Beside a node at rest both have the same jerk. Over a distance h, the time T follows from
-    h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
-
-    Args:
-        distance, speed, acceleration: Values at the nodes, in order; where the first or last speed is 0, the
-            acceleration is that of constant jerk, 0. Shape (N + 1,).
+    Over a distance h, the time T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each
+    satisfy. Beside a node at rest, where the acceleration is 0, both have the same jerk.
     """
     h, mean = np.diff(distance), (speed[:-1] + speed[1:]) / 2
     change = np.diff(acceleration)
@@ -203,13 +178,10 @@ def profile_through(distance: Array, speed: Array, acceleration: Array) -> Speed
 
 
 def profile_between(distance: Array, speed: Array, rates: tuple[Array, Array]) -> SpeedProfile:
-    """Return the speed profile through given nodes, with one segment of constant jerk between neighbouring nodes.
+    """Return the speed profile through nodes (N + 1,), with one segment of constant jerk between neighbouring nodes.
 
-    The time T over a distance h follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2; the acceleration jumps at nodes.
-
-    Args:
-        distance, speed: Values at the nodes, in order. Shape (N + 1,).
-        rates: Approximate accelerations where each interval begins and ends: the change a1 - a0 is kept. Shape (N,).
+    The time T over a distance h follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, where the change a1 - a0 is that of
+    the approximate accelerations `rates` at both ends of each interval (N,); the acceleration jumps at nodes.
     """
     h, mean = np.diff(distance), (speed[:-1] + speed[1:]) / 2
     change = np.minimum(rates[1] - rates[0], 2 * mean**2 / h)
@@ -234,11 +206,7 @@ def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Return the shortest time (s) in which the speed changes by `change` (m/s), with zero acceleration at both ends.
-
-    Raises:
-        ProblemError: The change is negative, or a limit is not positive.
-    """
+    """Return the shortest time (s) in which the speed changes by `change` (m/s), from and to zero acceleration."""
     require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
         require.positive(f"ramp: {name}", value)
@@ -255,10 +223,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) reached from a given speed over a distance (m), acceleration zero at both ends.
-
-    This is the inverse of ramp_distance; the same holds for slowing down from that speed.
-    """
+    """Return the greatest speed (m/s) reached over a distance (m); it is the inverse of ramp_distance."""
     # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
     # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
@@ -287,13 +252,7 @@ def ramp_phases(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def rest_profile(length: float, speed: float, acceleration: float, jerk: float) -> SpeedProfile:
-    """Return the fastest motion from rest to rest over a length (m) within limits of speed, acceleration and jerk.
-
-    Where the length is too short for the speed, the largest speed that can be reached takes its place.
-
-    Raises:
-        ProblemError: An argument is not positive or not finite.
-    """
+    """Return the fastest motion from rest to rest over a length (m), at the largest reachable speed if it is short."""
     for name, value in (("length", length), ("speed", speed), ("acceleration", acceleration), ("jerk", jerk)):
         require.positive(name, value)
     peak = min(speed, reachable_speed(0.0, length / 2, acceleration, jerk))

@@ -14,47 +14,31 @@ from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.curves import lagrange
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.tip_task import TipTask, target_rows, target_size
+from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE
 
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """Settings for choosing the mesh nodes that are needed to represent the targets of tasks.
+    """Settings for choosing the mesh nodes that are needed to represent the targets of tasks."""
 
-    Attributes:
-        points: Points of an interval of the mesh at which the targets determine the motion.
-        samples: Samples between two breaks at which the targets are compared with their interpolants.
-        pose_error: Largest error of an interpolated position, rotation matrix or direction, m and 1.
-        rate_error: Largest error of an interpolated velocity, relative to its largest value.
-        chord_error: Largest distance of a position, rotation matrix or direction from the chord of a time step of a
-            local motion, m and 1. It is small compared with an arm, so that two Newton steps correct the step's error.
-    """
-
-    points: int = 7
-    samples: int = 4
-    pose_error: float = 1e-6
-    rate_error: float = LIMIT_SHARE / 2
-    chord_error: float = 1e-3
+    points: int = 7  # of an interval of the mesh at which the targets determine the motion
+    samples: int = 4  # between two breaks at which the targets are compared with their interpolants
+    pose_error: float = 1e-6  # largest error of an interpolated position, rotation matrix or direction, m and 1
+    rate_error: float = LIMIT_SHARE / 2  # largest error of an interpolated velocity, relative to its largest value
+    chord_error: float = 1e-3  # largest distance of a pose from the chord of a time step, m and 1
 
 
 NODES = NodeSettings()
 
 
 class Target(NamedTuple):
-    """Target pose of a tip task at M times; coordinates that the task does not prescribe are nan.
+    """Target pose of a tip task at M times; coordinates that the task does not prescribe are nan."""
 
-    Attributes:
-        t: Times, s. Shape (M,).
-        position: Origin of the frame in the world. Shape (M, 3), m.
-        rotation: Axes of the frame in the world, as columns; with a free roll the tool axis alone, as the last column.
-            Shape (M, 3, 3).
-    """
-
-    t: Array
-    position: Array
-    rotation: Array
+    t: Array  # (M,), s
+    position: Array  # origin of the frame in the world, (M, 3), m
+    rotation: Array  # frame axes in the world as columns, (M, 3, 3); with a free roll the tool axis alone, the last one
 
 
 def targets_along(
@@ -66,16 +50,11 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target poses of all pose tasks along a given motion of the machine.
-
-    Targets that are relative to a link depend on this motion.
+    """Return the target poses of all pose tasks in world along a motion, since some are relative to a link.
 
     Args:
-        machine: The machine that does the tasks.
-        tasks: The tasks, each active from its begin to its end.
         times: Times on the clock of the tasks, s. Shape (M,).
-        base: Base configurations. Shape (M, base_size).
-        joints: Joint positions. Shape (M, joint_size).
+        base, joints: Configurations. Shapes (M, base_size), (M, joint_size).
         shown_times: Times to report in the targets if they differ from `times`, s. Shape (M,).
     """
     equations = bind(machine, tasks)
@@ -105,16 +84,11 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return the times at which a mesh requires nodes to represent the targets of tasks, both ends included.
+    """Return those of the breaks (k,) of targets that a mesh needs as nodes to represent them, both ends included.
 
-    Between two nodes, the interpolants of the targets at the points of an interval deviate by no more than `NODES`
-    allows. Intervals with larger deviations are bisected at the break nearest to their middle. A path of many short
-    segments thus needs no more nodes than a smooth path of the same shape. Tasks of a velocity need all breaks, since
-    velocity errors accumulate to a pose error.
-
-    Args:
-        equations: Equations of the tasks.
-        breaks: Increasing times at which the tasks are less smooth, s. Shape (k,), k >= 2.
+    Intervals are bisected at the break nearest to their middle until the interpolants of the targets deviate by no more
+    than `NODES` allows. A path of many short segments thus needs no more nodes than a smooth path of the same shape.
+    Velocity tasks need all breaks, since velocity errors accumulate to a pose error.
     """
     if not all(part.task.is_pose for part in equations.bound):
         return breaks
@@ -142,12 +116,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return the given times and additional ones, so that target poses are nearly linear in time between neighbours.
-
-    Args:
-        equations: Equations of the tasks.
-        times: Increasing times, s. Shape (k,), k >= 2.
-    """
+    """Return times (k,) and additional ones, so that target poses are nearly linear in time between neighbours."""
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
     poses, _ = _target_rows(equations)
@@ -164,16 +133,13 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of the pose values among the stacked targets of tasks, and the rows of each pose's velocities.
-
-    The velocity of an orientation or of a direction is an angular velocity.
-    """
+    """Return the indices of the pose values among the targets of tasks, and the rows of the velocity of each pose."""
     poses, rates, at = list[int](), list[slice](), 0
-    for task in (part.task for part in equations.bound):
-        for pose, rate in target_rows(task).values():
+    for part in equations.bound:
+        for pose, rate in part.target_rows.values():
             poses += range(at + pose.start, at + pose.stop)
             rates.append(slice(at + rate.start, at + rate.stop))
-        at += target_size(task)
+        at += part.target_size
     return poses, rates
 
 
@@ -195,11 +161,7 @@ def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]
 
 
 def tip_poses(machine: Machine, bases: Array, joints: Array) -> Array:
-    """Return tip poses of a machine in world as position and quaternion; nan if the robot has no tip. Shape (M, 7).
-
-    Args:
-        bases, joints: Configurations. Shapes (M, base_size) and (M, n).
-    """
+    """Return tip poses in world, position and quaternion; nan if the robot has no tip. Shape (M, 7)."""
     if machine.robot.tip is None:
         return np.full((len(joints), 7), np.nan)
     rotations, positions = _frames(machine, bases, joints)

@@ -1,8 +1,7 @@
 """Tasks for a frame of the machine: components of the frame's twist, or a pose over time, are prescribed.
 
 Pose tasks are differentiated to velocities, with the pose error fed back so that it does not accumulate (Baumgarte
-1972): task twist = twist of the target + gain x pose error. The functions of a `BoundTask` are expressions of this
-geometry: relative twists, pose errors, and the rows that the task selects from them.
+1972): task twist = twist of the target + gain x pose error.
 """
 
 from __future__ import annotations
@@ -15,17 +14,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
+from models import FreeFloating, Machine, SmoothPath, center_of_mass
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
-from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
-from ocp.errors import ProblemError, require
+from models.spatial import Frame, expression, on_scalars, skew
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
-Velocity: TypeAlias = Any
-"""Prescribed velocity: a constant or a function of time, with one entry for each row of the task."""
+Velocity: TypeAlias = Any  # constant or function of time with one entry for each row of the task
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
 Roll: TypeAlias = Literal["free", "given"]
 
@@ -104,8 +102,8 @@ class TipTask:
         require.choice("axes", self.axes, get_args(Axes))
         for attribute in ("link", "relative_to"):
             name = getattr(self, attribute)
-            if name is not None and not require.text(f"tip task: {attribute}", name):
-                raise ProblemError(f"tip task: {attribute} is an empty name", name=attribute, value=name)
+            if name is not None:
+                require.name(f"tip task: {attribute}", name)
         for attribute in ("gain", "start_gap", "begin"):
             require.nonnegative(attribute, getattr(self, attribute))
         if self.duration is not None:
@@ -115,24 +113,19 @@ class TipTask:
             if self.direction is None:
                 words = "within is an angle about a direction: give direction=... too"
                 raise ProblemError(words, name="within", value=self.within)
-        try:
-            axis = require.array("tip task: tool_axis", self.tool_axis, (3,))
-            object.__setattr__(self, "point", require.array("tip task: point", self.point, (3,)))
-            object.__setattr__(self, "rows", self._checked_rows())
-            object.__setattr__(self, "breaks", self._checked_breaks())
-            pair = require.array("tip task: tolerance", self.tolerance, (2,))
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
+        axis = require.array("tip task: tool_axis", self.tool_axis, (3,))
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
+        pair = require.array("tip task: tolerance", self.tolerance, (2,), sign="positive", meaning="m and rad")
+        object.__setattr__(self, "tolerance", tuple(pair.tolist()))
         object.__setattr__(self, "tool_axis", axis / np.linalg.norm(axis))
+        object.__setattr__(self, "point", require.array("tip task: point", self.point, (3,)))
+        object.__setattr__(self, "breaks", self._checked_breaks())
+        with problem_errors():
+            object.__setattr__(self, "rows", self._checked_rows())
         if self.direction is not None and not callable(self.direction) and _is_zero(self.direction):
             words = f"direction {np.ravel(self.direction).tolist()} has no length; say where the tool axis shall point"
             raise ProblemError(words, name="direction", value=self.direction)
-        if not (pair > 0).all():
-            words = f"tip task: tolerance must be two positive numbers, m and rad, not {self.tolerance!r}"
-            raise ProblemError(words, name="tolerance", value=self.tolerance)
-        object.__setattr__(self, "tolerance", tuple(pair.tolist()))
         if self.link is None and np.any(self.point):
             words = "a point is given in the frame of a link: name the link too"
             raise ProblemError(words, name="point", value=self.point)
@@ -158,14 +151,11 @@ class TipTask:
         Args:
             path: Path from `models.smooth`.
             speed: Speed between the two ramps, m/s, or a Schedule of the path, which specifies the whole motion.
-            acceleration: Largest acceleration along the path, m/s^2; None: 1 m/s^2.
-            jerk: Largest jerk along the path, m/s^3; None: the one that builds up the acceleration in 0.1 s.
-            steady: Whether the tip moves at the requested speed from the beginning of the path to its end, as in a pass
-                that is part of a longer motion. The motion then does not start at rest.
+            acceleration, jerk: Largest ones along the path, m/s^2 and m/s^3; None: 1 m/s^2, built up in 0.1 s.
+            steady: Whether the tip moves at this speed on the whole path, as in a pass that is part of a longer motion.
             roll: "free": the tool axis points as the path says and the roll about it is free (within a cone if `within`
                 is given); "given": the path prescribes the whole orientation.
-            others: Further attributes of the task: `tool_axis`, `link`, `gain`, `within`, `begin`, ...; `direction` or
-                `orientation` replace those of the path.
+            others: Further attributes of the task; `direction` or `orientation` replace those of the path.
 
         Raises:
             ProblemError: `path` is not a path, a number is not positive, an attribute is invalid, or acceleration and
@@ -264,12 +254,7 @@ def _refuse_ramps(reason: str, **arguments: Any) -> None:
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task whose targets are functions of a path parameter to a task whose targets are functions of time.
-
-    Args:
-        task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
-        clock: CasADi function time (s) -> parameter.
-    """
+    """Convert a task of a path parameter to a task of time, by the CasADi function `clock`: time (s) -> parameter."""
 
     def velocity(time: Any) -> Any:
         parameter = clock(time)
@@ -284,85 +269,139 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world)."""
+    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world).
+
+    The methods return expressions of the machine's base configuration and joint positions.
+    """
 
     task: TipTask
     tip: Machine
     reference: Machine | None
 
+    @property
+    def name(self) -> str:
+        """Name of the link whose frame the task moves."""
+        return self.task.link or self.tip.robot.tip_link
 
-def target_rows(task: TipTask) -> dict[str, tuple[slice, slice]]:
-    """Return, by name, which rows of a pose task's target column hold each target and which hold its velocity.
+    @property
+    def target_rows(self) -> dict[str, tuple[slice, slice]]:
+        """Rows of each target of a pose in the column of targets, and of its velocity (3 rows), by name: "position" (3
+        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), as far as given.
+        """
+        rows, at = dict[str, tuple[slice, slice]](), 0
+        for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
+            if getattr(self.task, name) is not None:
+                rows[name] = slice(at, at + size), slice(at + size, at + size + 3)
+                at += size + 3
+        return rows
 
-    By name, as far as given: "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction"
-    (3 rows). A velocity or an angular velocity has 3 rows.
-    """
-    rows, at = dict[str, tuple[slice, slice]](), 0
-    for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
-        if getattr(task, name) is not None:
-            rows[name] = slice(at, at + size), slice(at + size, at + size + 3)
-            at += size + 3
-    return rows
+    @property
+    def target_size(self) -> int:
+        """Number of values of the task in the column of targets."""
+        return self.task.size if not self.task.is_pose else max(rates.stop for _, rates in self.target_rows.values())
 
+    @property
+    def rate_rows(self) -> list[int]:
+        """Indices of the velocities and angular velocities among the targets of a pose task."""
+        return [row for _, rates in self.target_rows.values() for row in range(rates.start, rates.stop)]
 
-def target_size(task: TipTask) -> int:
-    """Return the number of target values of a task in the stacked column of the targets of all tasks."""
-    return task.size if task.velocity is not None else max(rates.stop for _, rates in target_rows(task).values())
+    def split_targets(self, targets: Any) -> tuple[Any, Any]:
+        """Split the targets into (position, velocity) and (rotation or direction, angular velocity); None if free."""
+        parts = {name: (targets[values], targets[rates]) for name, (values, rates) in self.target_rows.items()}
+        if "orientation" in parts:
+            parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]
+        return parts.get("position"), parts.get("orientation", parts.get("direction"))
 
+    def reference_pose(self, base: Any, joints: Any) -> Frame:
+        """Return the pose of the reference frame in the world."""
+        if self.reference is None:
+            return Frame(ca.DM.eye(3), ca.DM(3, 1))
+        return self.reference.tip_pose(base, joints)
 
-def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Split the target column of a pose task: (position, velocity), (rotation or direction, angular velocity).
+    def relative(self, base: Any, joints: Any, twist_of: Callable[[Any], Any]) -> Any:
+        """Return columns of twists of the tip relative to the reference, in world axes; `twist_of` gives those of the
+        tip of a machine. Shape (6, k).
+        """
+        twist = twist_of(self.tip)
+        if self.reference is None:
+            return twist
+        moving = twist_of(self.reference)
+        lever = self.tip.tip_pose(base, joints).position - self.reference.tip_pose(base, joints).position
+        return twist - ca.vertcat(moving[0:3, :], moving[3:6, :] - ca.mtimes(skew(lever), moving[0:3, :]))
 
-    Either part is None if the task does not prescribe it.
-    """
-    parts = {name: (targets[values], targets[rates]) for name, (values, rates) in target_rows(task).items()}
-    if "orientation" in parts:
-        parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]
-    return parts.get("position"), parts.get("orientation", parts.get("direction"))
+    def twist(self, base: Any, joints: Any, rates: Any) -> Any:
+        """Return the twist of the tip relative to the reference at given joint rates, in world axes. Shape (6, 1)."""
+        return self.relative(base, joints, lambda machine: machine.tip_twist(base, joints, rates))
 
+    def rows(self, base: Any, joints: Any, twist: Any) -> Any:
+        """Return the components that the task prescribes of columns of twists (6, k) in world axes. Shape (size, k)."""
+        task = self.task
+        angular, linear = twist[0:3, :], twist[3:6, :]
+        rotation = None
+        if task.axes == "base":
+            rotation = self.tip.world_from_base(base).rotation
+        elif task.axes == "tip":
+            rotation = self.tip.tip_pose(base, joints).rotation
+        elif task.axes == "reference" and self.reference is not None:
+            rotation = self.reference.tip_pose(base, joints).rotation
+        if rotation is not None:
+            twist = ca.vertcat(ca.mtimes(rotation.T, angular), ca.mtimes(rotation.T, linear))
+        selected = twist[list(task.chosen), :]
+        if not task.tilts:
+            return selected
+        normals = ca.mtimes(self.tip.tip_pose(base, joints).rotation, _tool_normals(task))
+        return ca.vertcat(ca.mtimes(normals.T, angular), selected)
 
-def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
-    """Return the pose of the reference frame in the world; None if the reference is the world."""
-    return None if part.reference is None else part.reference.tip_pose(base, joints)
+    def pose_error(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Return rotation error (axis times sine of angle) and position error in world axes. Shape (6, 1)."""
+        position_target, goal = self.split_targets(targets)
+        pose, reference = self.tip.tip_pose(base, joints), self.reference_pose(base, joints)
+        angular, linear = ca.DM(3, 1), ca.DM(3, 1)
+        if position_target is not None:
+            linear = reference.point(position_target[0]) - pose.position
+        if self.task.orientation is not None:
+            rotation = ca.mtimes(reference.rotation, goal[0])
+            angular = sum((cross_product(pose.rotation[:, i], rotation[:, i]) for i in range(3)), start=ca.DM(3, 1)) / 2
+        elif self.task.tilts:
+            tool = ca.mtimes(pose.rotation, ca.DM(self.task.tool_axis))
+            angular = cross_product(tool, ca.mtimes(reference.rotation, goal[0]))
+        return ca.vertcat(angular, linear)
 
+    def target_twist(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Return a target's twist relative to the reference plus pose feedback, in world axes. Shape (6, 1)."""
+        rotation = self.reference_pose(base, joints).rotation
+        linear, angular = (
+            ca.DM(3, 1) if target is None else ca.mtimes(rotation, target[1]) for target in self.split_targets(targets)
+        )
+        return ca.vertcat(angular, linear) + self.task.gain * self.pose_error(base, joints, targets)
 
-def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates: Any) -> Any:
-    """Return a twist, or columns of twists, of the tip relative to the reference frame, in world axes.
+    def pose_in_reference(self, base: Any, joints: Any) -> tuple[Any, Any]:
+        """Return position and rotation of the tip in the reference frame."""
+        pose, reference = self.tip.tip_pose(base, joints), self.reference_pose(base, joints)
+        back = reference.rotation.T
+        return ca.mtimes(back, pose.position - reference.position), ca.mtimes(back, pose.rotation)
 
-    Args:
-        twist: Twist of the tip, (6, 1), or the columns of its Jacobian.
-        rates: Joint rates of a single twist; None for the Jacobian with respect to the joint rates, "base" for that
-            with respect to the base twist.
-    """
-    if part.reference is None:
-        return twist
-    if isinstance(rates, str):
-        moving = part.reference.jacobians(base, joints)[0]  # type: ignore[attr-defined]
-    elif rates is None:
-        moving = part.reference.tip_jacobian(base, joints)
-    else:
-        moving = part.reference.tip_twist(base, joints, rates)
-    lever = part.tip.tip_pose(base, joints).position - part.reference.tip_pose(base, joints).position
-    return twist - ca.vertcat(moving[0:3, :], moving[3:6, :] - ca.mtimes(skew(lever), moving[0:3, :]))
+    def cone_cosine(self, base: Any, joints: Any, targets: Any) -> Any:
+        """Return the cosine of the angle between the tool axis and the target direction."""
+        goal = ca.mtimes(self.reference_pose(base, joints).rotation, self.split_targets(targets)[1][0])
+        return ca.dot(goal, ca.mtimes(self.tip.tip_pose(base, joints).rotation, ca.DM(self.task.tool_axis)))
 
+    @property
+    def is_holonomic(self) -> NDArray[np.bool_]:
+        """Mask of the velocity components that are rates of pose coordinates and so integrable. Shape (size,)."""
+        task = self.task
+        if task.is_pose:
+            return np.ones(task.size, dtype=bool)
+        all_angular = set(self.movable_angular_rows) <= set(task.chosen)
+        fixed = task.axes in ("world", "reference")
+        return np.array([fixed and (all_angular or row not in ANGULAR) for row in task.chosen], dtype=bool)
 
-def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the components that a task prescribes of a twist in world axes, or of each column of a twist matrix."""
-    task = part.task
-    angular, linear = twist[0:3, :], twist[3:6, :]
-    rotation = None
-    if task.axes == "base":
-        rotation = part.tip.world_from_base(base).rotation
-    elif task.axes == "tip":
-        rotation = part.tip.tip_pose(base, joints).rotation
-    elif task.axes == "reference" and part.reference is not None:
-        rotation = part.reference.tip_pose(base, joints).rotation
-    rotated = twist if rotation is None else ca.vertcat(ca.mtimes(rotation.T, angular), ca.mtimes(rotation.T, linear))
-    selected = rotated[list(task.chosen), :]
-    if not task.tilts:
-        return selected
-    normals = ca.mtimes(part.tip.tip_pose(base, joints).rotation, _tool_normals(task))
-    return ca.vertcat(ca.mtimes(normals.T, angular), selected)
+    @property
+    def movable_angular_rows(self) -> list[int]:
+        """World axes, 0..2, about which the joints can rotate the tip."""
+        base, joints = ca.SX.sym("base", self.tip.base_size), ca.SX.sym("joints", self.tip.joint_size)
+        jacobian = self.tip.tip_jacobian(base, joints)
+        return [row for row in ANGULAR if not all(entry.is_zero() for entry in ca.horzsplit(jacobian[row, :]))]
 
 
 def _tool_normals(task: TipTask) -> Any:
@@ -374,101 +413,22 @@ def _tool_normals(task: TipTask) -> Any:
     return ca.sparsify(ca.DM(basis[1:].T))
 
 
-def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the rotation error (axis times sine of angle) and position error of a tip in world axes. Shape (6, 1)."""
-    position_target, goal = split_targets(part.task, targets)
-    pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
-    angular, linear = ca.DM(3, 1), ca.DM(3, 1)
-    if position_target is not None:
-        linear = (position_target[0] if reference is None else reference.point(position_target[0])) - pose.position
-    if part.task.orientation is not None:
-        rotation = goal[0] if reference is None else ca.mtimes(reference.rotation, goal[0])
-        angular = sum((cross_product(pose.rotation[:, i], rotation[:, i]) for i in range(3)), start=ca.DM(3, 1)) / 2
-    elif part.task.tilts:
-        tool = ca.mtimes(pose.rotation, ca.DM(part.task.tool_axis))
-        angular = cross_product(tool, goal[0] if reference is None else ca.mtimes(reference.rotation, goal[0]))
-    return ca.vertcat(angular, linear)
-
-
-def target_twist(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return a target's twist relative to the reference frame plus pose feedback, in world axes. Shape (6, 1)."""
-    position_target, rotation_target = split_targets(part.task, targets)
-    reference = reference_pose(part, base, joints)
-    angular = ca.DM(3, 1) if rotation_target is None else rotation_target[1]
-    linear = ca.DM(3, 1) if position_target is None else position_target[1]
-    if reference is not None:
-        angular, linear = ca.mtimes(reference.rotation, angular), ca.mtimes(reference.rotation, linear)
-    return ca.vertcat(angular, linear) + part.task.gain * pose_error(part, base, joints, targets)
-
-
-def pose_in_reference(part: BoundTask, base: Any, joints: Any) -> tuple[Any, Any]:
-    """Return position and rotation of the tip in the reference frame."""
-    pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
-    if reference is None:
-        return pose.position, pose.rotation
-    rotation = reference.rotation
-    return ca.mtimes(rotation.T, pose.position - reference.position), ca.mtimes(rotation.T, pose.rotation)
-
-
-@on_scalars
-def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the components of the pose error that the task prescribes."""
-    return task_rows(part, base, joints, pose_error(part, base, joints, targets))
-
-
-def is_holonomic(part: BoundTask) -> Array:
-    """Return which velocity components of a task are rates of pose coordinates and so integrable. Shape (size,)."""
-    task = part.task
-    if task.is_pose:
-        return np.ones(task.size, dtype=bool)
-    all_angular = set(movable_angular_rows(part)) <= set(task.chosen)
-    fixed_axes = task.axes in ("world", "reference")
-    return np.array([all_angular and fixed_axes if row in ANGULAR else fixed_axes for row in task.chosen], dtype=bool)
-
-
-def movable_angular_rows(part: BoundTask) -> list[int]:
-    """Return the world axes, 0..2, about which the joints can rotate the tip."""
-    base, joints = ca.SX.sym("base", part.tip.base_size), ca.SX.sym("joints", part.tip.joint_size)
-    jacobian = part.tip.tip_jacobian(base, joints)
-    return [row for row in ANGULAR if not all(entry.is_zero() for entry in ca.horzsplit(jacobian[row, :]))]
-
-
-def derivative(value: Any, time: Any) -> Any:
-    """Return the time derivative of an expression as a dense matrix, zero for a constant."""
-    return ca.densify(ca.jacobian(value, time)) if isinstance(value, ca.SX | ca.MX) else ca.DM.zeros(*value.shape)
-
-
-@on_scalars
-def rotation_of(quaternion: Any) -> Any:
-    """Return the rotation matrix of a quaternion, computed on scalar symbols."""
-    return rotation_from_quaternion(quaternion)
-
-
 @on_scalars
 def cross_product(a: Any, b: Any) -> Any:
     """Return the cross product a x b, computed on scalar symbols."""
     return ca.mtimes(skew(a), b)
 
 
-@on_scalars
-def angular_velocity(rotation: Any, rate: Any) -> Any:
-    """Return the angular velocity in world axes from a rotation matrix and its derivative. Shape (3, 1)."""
-    spin = ca.mtimes(rate, rotation.T)
-    return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
-
-
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of task equations that no base motion with a fixed centre of mass affects.
-
-    Raises:
-        ProblemError: The momentum moves the centre of mass, and the joints cannot return.
+    """Return the combinations of the selected task equations that no base motion with a fixed centre of mass affects;
+    raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return.
     """
     jacobians = []
     for bound in bound_tasks:
-        base_jacobian = relative_twist(bound, base, joints, bound.tip.jacobians(base, joints)[0], rates="base")  # type: ignore[attr-defined]
-        jacobians.append(np.array(ca.DM(task_rows(bound, ca.DM(base), ca.DM(joints), base_jacobian))))
+        base_jacobian = bound.relative(base, joints, lambda machine: machine.jacobians(base, joints)[0])
+        jacobians.append(np.array(ca.DM(bound.rows(ca.DM(base), ca.DM(joints), base_jacobian))))
     frame = machine.world_from_base(base)
     lever = center_of_mass(machine.robot, joints, frame) - frame.position
     center = np.array(ca.DM(ca.horzcat(-skew(lever), ca.DM.eye(3))))[:, machine.twist_rows]
@@ -488,10 +448,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return the linear combinations of the first `count` rows of a matrix that are combinations of its other rows too.
-
-    Each column has the coefficients of one combination; the columns are orthonormal. Shape (count, k).
-    """
+    """Return the linear combinations (count, k) of the first rows of a matrix that its other rows span too."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

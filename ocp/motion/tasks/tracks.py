@@ -22,19 +22,15 @@ from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import SpeedProfile
 
-Track: TypeAlias = Any
-"""Target over time: a constant, or a function of CasADi time (s) that returns a vector, matrix or list of expressions.
-"""
+Track: TypeAlias = Any  # constant, or function of CasADi time (s) that returns a vector, matrix or list of expressions
 
 _Result = TypeVar("_Result")
 
-MAX_ROTATION_RAD = np.pi - 1e-3
-"""Largest rotation between the two poses of a `pose_line`, because the sense of half a turn is ambiguous."""
+MAX_ROTATION_RAD = np.pi - 1e-3  # largest rotation of a `pose_line`, since the sense of half a turn is ambiguous
 PATH_ACCELERATION = 1.0
 """Default acceleration along a path, m/s^2. Controllers of robot arms have defaults of about this size for motions on
 straight lines (Universal Robots: 1.2 m/s^2)."""
-RISE_TIME_S = 0.1
-"""Time in which the default jerk builds up the acceleration along a path, s."""
+RISE_TIME_S = 0.1  # time in which the default jerk builds up the acceleration along a path, s
 
 
 class PoseLine(NamedTuple):
@@ -54,14 +50,13 @@ def pose_line(
     """Return a motion on a straight line between two poses, with rotation about a fixed axis at the same pace (slerp).
 
     Args:
-        first, second: (Orientation, position), the orientation as a matrix (3, 3) or a quaternion (4,); a numeric Frame
-            such as `machine.tip_pose(base, q)` is accepted.
+        first, second: (Orientation, position), numeric, the orientation a matrix (3, 3) or a quaternion (4,).
         duration: Time from the first pose to the second, s. With pace "rest" the pose is constant before and after.
         pace: "constant" for constant speed, "rest" for the polynomial that starts and ends at rest.
 
     Raises:
-        ProblemError: Wrong sizes, a matrix that is no rotation, half a turn, whose sense is ambiguous, or a duration
-            that is not positive.
+        ProblemError: A size or the duration is wrong, a matrix is no rotation, or the turn is half a turn, thus
+            ambiguous.
     """
     require.choice("pace", pace, ("constant", "rest"))
     require.positive("duration", duration)
@@ -90,11 +85,7 @@ def pose_line(
 
 @dataclass(frozen=True, eq=False)
 class TrackWithRate:
-    """Target position, direction or orientation as a function of time, together with its time derivative.
-
-    Attributes:
-        track, rate: Functions of CasADi time (s).
-    """
+    """Target position, direction or orientation as a function of CasADi time (s), together with its time derivative."""
 
     track: Callable[[Any], Any]
     rate: Callable[[Any], Any]
@@ -104,18 +95,12 @@ class TrackWithRate:
 
 
 class PathTracks(NamedTuple):
-    """Functions of time for the position and orientation of a tool that moves along a path.
-
-    Attributes:
-        position, orientation: Tracks of the tool frame.
-        duration: Time from one end to the other, s.
-        breaks: Times at which segments of the path or of the speed profile meet, both ends included. Shape (k,), s.
-    """
+    """Functions of time for the position and orientation of a tool that moves along a path."""
 
     position: Callable[[Any], Any]
     orientation: Callable[[Any], Any]
-    duration: float
-    breaks: Array
+    duration: float  # s
+    breaks: Array  # times at which segments of the path or of the speed profile meet, both ends included, (k,), s
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
         """Return the direction (3,) of an axis of the tool frame as a function of time with a rate."""
@@ -144,14 +129,9 @@ def checked_speed(speed: Any) -> float:
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return the functions of time that describe the motion of a tool along a path.
+    """Return the functions of time of a tool that moves along a path; in builders they need symbols=casadi.MX.
 
-    They need symbols=casadi.MX in builders. A mesh with nodes at `breaks` keeps its full order.
-
-    Args:
-        path: Path from `models.smooth`, with the orientation of the tool.
-        speed: Constant, m/s; or the speed over time as a SpeedProfile or a Schedule of the path
-            (`ocp.motion.schedule.schedule`).
+    The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
     Raises:
         ProblemError: `path` is not a path, the speed is not positive, or the profile is of another path.
@@ -193,11 +173,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Convert a target from a function of a path parameter to a function of time; return constants unchanged.
-
-    Args:
-        clock: CasADi function time (s) -> parameter.
-    """
+    """Convert a target of a path parameter to one of time, by a CasADi function `clock`: time (s) -> parameter."""
     if not callable(track):
         return track
 
@@ -237,17 +213,12 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a target, given as a constant or a function of time, as a dense expression of the symbol `time`.
-
-    Args:
-        track: A constant, or a function: CasADi time -> CasADi matrix, array, or a list of expressions.
-        time: The symbol.
-        shapes: Expected shape, or several that are accepted.
-        what: Name of the track in errors.
-        begin: Begin of the track, s; it counts its time from there.
+    """Return a target, a constant or a function of CasADi time since its begin, as a dense expression of the symbol
+    `time`.
 
     Raises:
-        ProblemError: Another shape, a value that is not finite, or an expression of anything but the time.
+        ProblemError: Another shape than those allowed, a value that is not finite, or an expression of anything but the
+            time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
     value = _call_track(track, time - begin if begin else time, what) if callable(track) else track
@@ -277,10 +248,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """Evaluate a user's target function; raise ProblemError if it fails.
-
-    Errors that show that the function cannot take symbols of CasADi's type SX are passed on.
-    """
+    """Evaluate a target function; raise ProblemError if it fails, but pass on errors that SX symbols cause."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

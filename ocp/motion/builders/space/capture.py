@@ -5,15 +5,10 @@ Chaser and target both float. The target has no joints and no external forces ac
 
     R' = [R I^-1 R^T L x] R,    c' = P / m,
 
-and its tip is the grasped frame. The chaser's tip reaches that frame with the same twist, at a time that may be free.
-From then on both are one machine, with the target a link on the chaser's tip. Base and joints are continuous, and the
-momentum is that of both (`space.pair`), a constant known in advance. At the end neither joints nor base turn. The
-wheels then hold the momentum, and must be able to (`ocp.motion.builders.space.pair`). Rest is relative to the centre
-of mass of the pair, which moves on at P / m.
-
-Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives together, but without wheels:
-there the chaser's momentum, `conserved_momentum` here, cancels that of the target. `chained_capture` plans each phase
-at its own least effort, one after the other.
+and its tip is the grasped frame, which the chaser's tip reaches with the same twist. From then on both are one machine,
+with their total momentum. At the end neither joints nor base turn, relative to the centre of mass of the pair, and the
+wheels hold the momentum. Virgili-Llop and Romano 2019 (Frontiers in Robotics and AI 6:14) also plan both objectives
+together, but without wheels: there the chaser's momentum cancels that of the target.
 """
 
 from __future__ import annotations
@@ -27,12 +22,12 @@ import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
 from models.checks import Array
-from models.spatial import Expression
+from models.spatial import Expression, Frame
 from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities
+from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, end_velocities
 from ocp.motion.builders.dynamics_plan import SolveSettings, within_limits
 from ocp.motion.builders.space.pair import (
     State,
@@ -48,7 +43,6 @@ from ocp.motion.builders.space.pair import (
     wheel_capacity,
 )
 from ocp.motion.builders.standing.problem import FreeTime
-from ocp.motion.builders.torques import JointFriction
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.goals import Cost, Start
 from ocp.motion.tasks.limits import Limits
@@ -172,22 +166,19 @@ def capture_problem(
     from the start of each phase.
 
     Args:
-        chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`). Its momentum is that at the
-            start, spinning wheels included.
-        capture: The capture.
+        chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`), with its momentum at the start.
         start: Joint positions of the chaser, shape (n,), rad or m, or a `Start` with base and velocities.
         limits, cost: Arguments of `dynamics_problem` for both phases.
         clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
 
     Raises:
-        ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. Or with
-            name "momentum": the wheels cannot hold the momentum of both at rest; `value` is its norm and `limit` the
-            largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
-            reach of the arm, m.
+        ProblemError: Machines, sizes or values are invalid, see `dynamics_problem`, or the target has joints. With name
+            "momentum": the wheels cannot hold the momentum of both at rest; `value` is its norm and `limit` the largest
+            that they hold, N m s. With name "reach": `value` is the distance of the target and `limit` the reach of the
+            arm, m.
     """
-    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
-    first, second = own.approach(), own.declare_second_phase(None)
-    own.guess_approach(first)
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
+    second, first = own.declare_second_phase(None), own.approach(clearance_constraints)
     guess_braking(second, own.pair, _end_of_guess(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
@@ -207,39 +198,17 @@ def solve_capture(
     chaser: FreeFloating,
     capture: Capture,
     *,
-    start: Any,
-    limits: Limits | None = None,
-    cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
-    method: Collocation | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    method: Collocation = POINTS,
+    **options: Any,
 ) -> Solution:
-    """Plan the capture of a tumbling body within limits at the least total cost, and audit the plan.
-
-    The problem is `capture_problem`. The plan satisfies its limits between the nodes of the mesh, too.
-
-    Args:
-        chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
-        method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 if None.
-        tolerances: Tolerances of the audit by name.
-
-    Returns:
-        The solution; its phases are "approach" and "detumble".
-
-    Raises:
-        ProblemError: As `capture_problem`.
-        SolveError: No motion satisfies its limits.
-    """
+    """Solve `capture_problem` with its options within its limits everywhere, first on the mesh `method`."""
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:
-        return capture_problem(
-            chaser, capture, start=start, limits=limits, cost=cost, clearance_constraints=constraints
-        )
+        return capture_problem(chaser, capture, clearance_constraints=constraints, **options)
 
-    machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, limits))
-    mesh = POINTS if method is None else method
-    settings = SolveSettings(mesh, tolerances=tolerances)
-    return within_limits(declare, clearance_constraints, machines, settings=settings)
+    machines = dict.fromkeys((APPROACH, DETUMBLE), (chaser, options.get("limits")))
+    return within_limits(declare, clearance_constraints, machines, settings=SolveSettings(method))
 
 
 @interruptible
@@ -251,29 +220,31 @@ def chained_capture(
     limits: Limits | None = None,
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
-    method: Collocation | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    method: Collocation = POINTS,
 ) -> tuple[Solution, Solution]:
     """Plan the approach of a capture by itself, then the detumbling from its end, each at its own lowest cost.
 
-    The total cost exceeds that of `solve_capture`.
+    The total cost exceeds that of `capture_problem`, which has the same arguments.
 
-    Args, Raises: As for `solve_capture`.
+    Args:
+        method: First mesh of both phases, with controls at the points; 8 Legendre intervals of degree 4 by default.
 
     Returns:
         Both solutions, each with its own audit.
+
+    Raises:
+        ProblemError: As `capture_problem`.
+        SolveError: No motion satisfies its limits.
     """
-    mesh = POINTS if method is None else require.instance("method", method, Collocation)
-    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    settings = SolveSettings(require.instance("method", method, Collocation))
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
     own.declare_second_phase(None)  # raises before the approach is solved
 
     def declare_approach(constraints: ClearanceConstraints | None) -> Problem:
-        problem = replace(own, clearance_constraints=constraints).approach()
+        problem = own.approach(constraints)
         own.grasp(problem, *motion_of(problem), problem.declared.states["target"].symbol)
-        own.guess_approach(problem)
         return problem
 
-    settings = SolveSettings(mesh, tolerances=tolerances)
     first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
     end["joints"] = own.arm_weights * end["joints"]
@@ -288,11 +259,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases of a capture: the chaser alone, and the chaser and its target as one machine.
-
-    Raises:
-        ProblemError: As `capture_problem`.
-    """
+    """Return the machines of both phases of a capture: the chaser, and chaser and target as one machine."""
     return chaser, replace(chaser, robot=checked_pair(chaser, target))
 
 
@@ -305,17 +272,9 @@ class _Capture:
     pair: FreeFloating
     start: State
     shared: Mapping[str, Any]
-    clearance_constraints: ClearanceConstraints | None
 
     @classmethod
-    def checked(
-        cls,
-        chaser: FreeFloating,
-        capture: Capture,
-        start: Any,
-        shared: Mapping[str, Any],
-        clearance_constraints: ClearanceConstraints | None,
-    ) -> _Capture:
+    def checked(cls, chaser: FreeFloating, capture: Capture, start: Any, shared: Mapping[str, Any]) -> _Capture:
         target = require.instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
         begin, joints, base = Start.of(start, chaser)
@@ -333,7 +292,7 @@ class _Capture:
         if capture.rest:
             bounds = (shared["limits"] or Limits()).bounds(chaser)
             require_capacity(chaser, momentum, wheel_capacity(chaser, bounds, state, capture.friction is None))
-        return cls(chaser, capture, pair, state, shared, clearance_constraints)
+        return cls(chaser, capture, pair, state, shared)
 
     @property
     def arm_weights(self) -> Array:
@@ -341,48 +300,42 @@ class _Capture:
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
-    def approach(self) -> Problem:
+    def approach(self, clearance_constraints: ClearanceConstraints | None) -> Problem:
         """Declare the problem of the approach, with the pose of the target as a state and the cone as a constraint."""
-        chaser, target, duration = self.chaser, self.capture.target, self.capture.approach
-        problem = dynamics_problem(
-            chaser,
-            (),
-            duration,
-            start=self.start.joints,
-            setup=DynamicsSetup(
-                start_velocity=self.start.velocities,
-                end_velocity="free",
-                start_base=self.start.base,
-                friction=self.capture.friction,
-                clearance_constraints=self.clearance_constraints,
-            ),
-            **self.shared,
+        chaser, target, duration, start = self.chaser, self.capture.target, self.capture.approach, self.start
+        setup = DynamicsSetup(
+            start_velocity=start.velocities,
+            end_velocity="free",
+            start_base=start.base,
+            friction=self.capture.friction,
+            clearance_constraints=clearance_constraints,
         )
-        earliest = duration.lower if isinstance(duration, FreeTime) else duration
-        require_reach(chaser, target, self.start, earliest)
+        problem = dynamics_problem(chaser, (), duration, start=start.joints, setup=setup, **self.shared)
+        require_reach(chaser, target, start, duration.lower if isinstance(duration, FreeTime) else duration)
         base, joints, _ = motion_of(problem)
-        none = ca.DM(0, 1)
-        begin = self.start.target_base
+        none, begin, cone = ca.DM(0, 1), start.target_base, self.capture.cone
         goal = problem.state("target", target.base_size, initial=begin, guess=begin, unit="m, rad")
         problem.dynamics(goal, target.base_rate(goal, none, none))
-        tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
-        place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        cone = self.capture.cone
         if cone is not None:
             self._require_inside(cone)
-            problem.path("cone", cone.inside(place), lower=0.0, unit="m")
+            problem.path("cone", cone.inside(self.tip_in_grasp(base, joints, goal).position), lower=0.0, unit="m")
+        out = np.zeros(3) if cone is None else cone.length * cone.direction
+        guess_approach(problem, chaser, target, start, out=out)
         return problem
+
+    def tip_in_grasp(self, base: Any, joints: Any, goal: Any) -> Frame:
+        """Return the pose of the chaser's tip in the grasped frame of a target with base configuration `goal`."""
+        tip, grasped = self.chaser.tip_pose(base, joints), self.capture.target.tip_pose(goal, ca.DM(0, 1))
+        back = grasped.rotation.T
+        return Frame(ca.mtimes(back, tip.rotation), ca.mtimes(back, tip.position - grasped.position))
 
     def _require_inside(self, cone: Cone) -> None:
         """Raise ProblemError if the tip starts near the grasp but outside the cone."""
-        start = self.start
-        tip = self.chaser.tip_pose(start.base, start.joints)
-        grasped = self.capture.target.tip_pose(start.target_base, ca.DM(0, 1))
-        place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position)))
-        inside = float(cone.inside(ca.DM(place)))
+        place = ca.DM(self.tip_in_grasp(self.start.base, self.start.joints, self.start.target_base).position)
+        distance, inside = float(ca.norm_2(place)), float(cone.inside(place))
         if inside < 0:
             words = (
-                f"capture: the tip starts {np.linalg.norm(place):.4g} m from the grasp and {-inside:.4g} m outside the "
+                f"capture: the tip starts {distance:.4g} m from the grasp and {-inside:.4g} m outside the "
                 f"cone, which is open to all directions at {2 * cone.length:.4g} m; start farther away or inside it"
             )
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
@@ -412,21 +365,17 @@ class _Capture:
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
         """Add the end condition that the chaser's tip has the pose and the twist of the grasped frame."""
-        chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
-        tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
-        turned = ca.mtimes(grasped.rotation.T, tip.rotation)
-        place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
-        rows = chaser.twist_rows
-        problem.end("grasp pose", ca.vertcat(ca.inv_skew(turned), place)[rows], 0.0, 0.0, unit="rad, m")
-        problem.end("grasp side", ca.trace(turned), lower=1.0)  # excludes half a turn
-        twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
+        tip, rows, none = self.tip_in_grasp(base, joints, goal), self.chaser.twist_rows, ca.DM(0, 1)
+        problem.end("grasp pose", ca.vertcat(ca.inv_skew(tip.rotation), tip.position)[rows], 0, 0, unit="rad, m")
+        problem.end("grasp side", ca.trace(tip.rotation), lower=1.0)  # excludes half a turn
+        twist = self.chaser.tip_twist(base, joints, rates) - self.capture.target.tip_twist(goal, none, none)
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
         """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
 
-        The dynamics conserve the position of the centre of mass and the norm of the quaternion. Their continuity would
-        be a condition that no control influences, and would leave the second-order conditions undetermined.
+        The dynamics conserve this motion and the norm of the quaternion. Their continuity would be a condition that no
+        control influences, and would leave the second-order conditions undetermined.
         """
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
         attitude = _of_unit_length(chaser, base)[size:]
@@ -435,12 +384,6 @@ class _Capture:
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
         place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
         return ca.vertcat(place, attitude)
-
-    def guess_approach(self, problem: Problem) -> None:
-        """Set the initial guesses of the states and controls in the optimal control problem of an approach."""
-        cone = self.capture.cone
-        out = np.zeros(3) if cone is None else cone.length * cone.direction
-        guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
 def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:

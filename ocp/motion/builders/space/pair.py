@@ -5,10 +5,6 @@ about its common centre of mass, are
 
     P = P1 + P2,    L = L1 + L2 + (c2 - c1) x (m1 P2 - m2 P1) / (m1 + m2).
 
-The target's motion is known, whatever the chaser does. The guess moves the tip by the damped pseudo-inverse of the
-generalized Jacobian from its start onto the path of the grasped frame, first beside it, at last along the approach
-axis. After the grasp the arm slows down evenly while the wheels take the momentum. The guesses obey the dynamics.
-
 Two bounds hold for any motion of the chaser. The grasp may be out of reach of the arm. And the momentum of both may
 exceed what the wheels store: a wheel of inertia I and speed limit w stores h a along its axis a with |h| <= I w, and no
 more than its motor gives it in the time. The base can turn to align the momentum with any of its axes; hence the
@@ -37,22 +33,14 @@ from ocp.problem.values import constant
 
 
 def join_target(chaser: Robot, target: Robot) -> Robot:
-    """Attach the target to the chaser's robot as an additional link; the tip frames of both robots coincide.
-
-    Raises:
-        ModelError: A robot has no tip, or links have the same name.
-    """
+    """Attach the target to the chaser's robot as an additional link; the tip frames of both robots coincide."""
     turn = np.asarray(target.tip_rotation).T
     shift = -turn @ np.asarray(target.tip_translation)
     return attach_tool(chaser, target, None, shift, rotation=turn, keep_tip=True)
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Check a chaser and its target, and return both as one robot; see `join_target`.
-
-    Raises:
-        ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
-    """
+    """Check a chaser and its target, and return both as one robot; see `join_target`."""
     for name, machine in (("chaser", chaser), ("target", target)):
         if require.instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
             raise ProblemError(f"capture: the robot of the {name} needs a tip", name=name, value=machine)
@@ -73,12 +61,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
 def pair_momentum(
     chaser: FreeFloating, target: FreeFloating, *, base: Any, target_base: Any, joints: Any
 ) -> Expression:
-    """Return the momentum of chaser and target about their common centre of mass, in the order of `conserved_momentum`.
-
-    Args:
-        base, target_base: Configurations of both bases. Shape (base_size,).
-        joints: Joint positions of the chaser. Shape (n,).
-    """
+    """Return the `conserved_momentum` of chaser and target together, about their common centre of mass."""
     rows = ca.DM.eye(6)[:, chaser.twist_rows]
     own = rows @ ca.vertcat(chaser.conserved_momentum)
     theirs = rows @ ca.vertcat(target.conserved_momentum)
@@ -96,7 +79,7 @@ def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
 
 
 def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
-    """Return the force and the moment about the tip that the hand exerts on the target, in world axes. Shape (3, 1).
+    """Return force and moment (3, 1) about the tip that the hand exerts on the target, in world axes.
 
     They are the rates of the target's momentum, m c'' and (I w)' about its centre of mass.
     """
@@ -112,8 +95,7 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
     return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
 
 
-Guesses = dict[str, Any]
-"""Type of an initial guess: a dictionary from the names of states and controls to functions of time."""
+Guesses = dict[str, Any]  # functions of time by the names of states and controls
 
 
 @dataclass(frozen=True)
@@ -144,9 +126,8 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
     """Set the initial guess of an approach; if its duration is free, try several until the tip gets to the grasp.
 
-    Args:
-        start: State of the capture; free velocities are guessed as zero.
-        out: Offset of the tip from the grasp before the final approach, in the grasped frame. Shape (3,), m.
+    The tip moves by the damped pseudo-inverse of the generalized Jacobian onto the path of the grasped frame, first
+    beside it at the offset `out` (3,), m, in this frame, at last along the approach axis. The guess obeys the dynamics.
     """
     joints, base = start.joints, start.base
     horizon = problem.declared.horizon
@@ -327,18 +308,11 @@ def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
                 pool[name] = replace(pool[name], guess=guess)
 
 
-ROUNDING = 1e-9
-"""Rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s."""
+ROUNDING = 1e-9  # rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s
 
 
 class State(NamedTuple):
-    """Initial state of a capture, and the longest durations of its phases.
-
-    Attributes:
-        base, joints, velocities: State of the chaser; nan for free velocities.
-        target_base: Configuration of the target.
-        approach, detumble: Longest durations of the phases, s.
-    """
+    """Initial state of a capture, with nan for free velocities, and the longest durations of its phases, s."""
 
     base: Array
     joints: Array
@@ -351,10 +325,7 @@ class State(NamedTuple):
 def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, frictionless: bool = True) -> float:
     """Return the largest angular momentum that the wheels of a chaser can store while its base is at rest, N m s.
 
-    Args:
-        bounds: Limits of its joints.
-        start: State of the capture.
-        frictionless: Whether only its motor acts on a wheel about its axis.
+    `frictionless` tells whether only its motor acts on a wheel about its axis.
     """
     robot, time = machine.robot, start.approach + start.detumble
     known = frictionless and not np.isnan(start.velocities).any()
@@ -381,12 +352,7 @@ def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, fri
 
 
 def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) -> None:
-    """Raise ProblemError if the wheels cannot store the pair's angular momentum in any final attitude of the base.
-
-    Args:
-        momentum: Momentum of both bodies, see `pair_momentum`.
-        capacity: Largest angular momentum that the wheels can hold, N m s.
-    """
+    """Raise ProblemError if the wheels cannot store the pair's angular momentum in any final attitude of the base."""
     angular = [k for k, row in enumerate(machine.twist_rows) if row < 3]
     size = float(np.linalg.norm(np.asarray(momentum)[angular]))
     if size > capacity * (1 + ROUNDING) + ROUNDING:
@@ -403,10 +369,6 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
 
     Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
     stretched.
-
-    Args:
-        start: State of the capture, with the latest time of the grasp.
-        earliest: Earliest time of the grasp, s.
     """
     reach = _reach(chaser, target)
     offset, drift = _relative_motion(chaser, target, start)

@@ -1,12 +1,9 @@
 """Planners of the motions and footsteps of standing machines: they solve a problem and audit the plan.
 
-`solve_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
-
 `solve_steps` first checks on a coarse mesh whether the steps are possible in their durations, because a solver may
 search long for steps that are too fast. With durations that may grow, at a price that outweighs the rest of the cost, a
-solution nearly always exists: with the requested durations if possible, else with the least extension. A few intervals
-give the durations to a percent or two. The solution is a local minimum, hence no proof. Steps are therefore refused
-only if a solve with the requested durations fails, too. Otherwise the coarse solution is the guess.
+solution nearly always exists. It is a local minimum, hence no proof: steps are refused only if a solve with the
+requested durations fails, too. Otherwise the coarse solution is the guess.
 """
 
 from __future__ import annotations
@@ -14,19 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from models.machines.standing import Standing
 from ocp.audit.audit import Audit
-from ocp.console import interruptible, time_left, time_limited
+from ocp.console import interruptible, time_left
 from ocp.direct.discretisation import Collocation, MultipleShooting
-from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
+from ocp.errors import ProblemError, SolveError, SolverStatus, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
-from ocp.motion.builders.dynamics_plan import IPOPT, SolveSettings, audit_error, breaks_of
+from ocp.motion.builders.dynamics_plan import SolveSettings, audit_error
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
@@ -54,8 +51,7 @@ class PaceSettings:
     guess: float = 5.0  # guess of a duration, over the requested one
     longest: float = 50.0  # upper bound of a duration, over the requested one
     samples: int = 21  # number of samples of a phase at which active limits are searched
-    # distance of a quantity from its limit, over its range along the motion, at which this counts as active
-    active: float = 0.01
+    active: float = 0.01  # distance from a limit, per range along the motion, at which it counts as active
     names: int = 3  # largest number of limits named in a message
 
 
@@ -67,14 +63,10 @@ def guess_in_time(
 ) -> dict[str, Any] | None:
     """Solve a footstep motion in the requested durations on a coarse mesh, as an initial guess; return None on failure.
 
-    Args:
-        step_options: Cost and limits of steps_problem.
-        options: IPOPT options.
-
     Raises:
-        SolveError: The quickest steps take longer than requested, and no steps in the requested durations were found:
-            `name` is the phase with the largest extension, `value` and `limit` its quickest and requested durations, s.
-            Or no steps were found in any durations; then `conflicts` has the constraints that would have to be relaxed.
+        SolveError: The quickest steps take longer than requested: `name` is the phase with the largest extension,
+            `value` and `limit` its quickest and requested durations, s. Or no steps were found in any durations; then
+            `conflicts` has the constraints that would have to be relaxed.
     """
     seconds = {
         name: phase.seconds
@@ -193,29 +185,19 @@ POINTS = Collocation(20, degree=5, scheme="legendre")
 """Mesh with controls at the collocation points, for smooth plans, which pass the audit with few intervals."""
 LINEAR = MultipleShooting(50, control="linear")
 """Mesh with controls linear between the nodes, for plans that switch between limits, such as those of least time."""
-STEPS = Collocation(12, degree=3, scheme="legendre")
-"""First mesh of each phase in `solve_steps`."""
-MESHES = 3
-"""Largest number of meshes for each formulation; a mesh is twice as fine as the mesh before."""
-POSE_TOLERANCE = 1e-5
-"""Largest accepted pose error of the re-integrated plan, m and rad; a start gap that a task allows may be larger."""
+STEPS = Collocation(12, degree=3, scheme="legendre")  # first mesh of each phase in `solve_steps`
+MESHES = 3  # largest number of meshes for each formulation; a mesh is twice as fine as the mesh before
+POSE_TOLERANCE = 1e-5  # largest pose error of the re-integrated plan, m and rad, unless a task has a larger gap
 
 Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """Result of one solve with a certain formulation and mesh.
-
-    Attributes:
-        name: Formulation, mesh, and whether bounds were tightened.
-        solution: Plan, or last iterate; None if there is neither.
-        failure: Reason why the solution is no plan; None if it is one.
-        exceeded: Whether its only failures are inequalities exceeded between the points of the grid.
+class Attempt(NamedTuple):
+    """Result of one solve: plan or last iterate, why it is no plan, and whether this is only that inequalities are
+    exceeded between the points of the grid.
     """
 
-    name: str
     solution: Solution | None
     failure: SolveError | None = None
     exceeded: bool = False
@@ -233,21 +215,14 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Plan a motion of a standing machine; try several formulations until the audit accepts a plan.
+    """Solve several formulations of `standing_problem` until the audit accepts a plan of a standing machine.
 
-    The problem is `standing_problem`. The first plan that passes its audit with pose errors below 1e-5 (m, rad)
-    everywhere is returned. Accelerations at the collocation points are tried first, or, if the final time is free,
-    accelerations linear between the nodes. Jerks are at the points. If the only failures of a plan are limits exceeded
-    between the points, they are tightened there. Other plans are solved again from themselves on up to two meshes, each
-    twice as fine.
+    The first plan that passes its audit with pose errors below 1e-5 (m, rad) everywhere is returned. Accelerations at
+    the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
+    are at the points. If the only failures of a plan are limits exceeded between the points, they are tightened there.
+    Other plans are solved again from themselves on up to two meshes, each twice as fine.
 
-    Args:
-        machine, tasks, horizon, start, weights, limits: As for `standing_problem`; the rule for the zero moment point
-            is that of the limits.
-        setup: As for `standing_problem`, but `tip_level` is chosen here. If bodies collide, they are separated by
-            constraints and the motion is planned again.
-        settings: First mesh, solver options and audit tolerances. The `control` of a given mesh selects the only
-            formulation that is tried.
+    The `tip_level` of the setup is chosen here, and the `control` of a given mesh selects the only formulation tried.
 
     Raises:
         SolveError: No attempt passes. The message has the result of each; the fields are those of the last failure.
@@ -256,7 +231,7 @@ def solve_standing(
     solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     setup = StandingSetup() if setup is None else require.instance("solve_standing: setup", setup, StandingSetup)
     along_parameter = setup.along == "parameter"
-    judge = _Judge(solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
+    judge = partial(_audited, solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
     timed = not (isinstance(horizon, FreeTime) or along_parameter)
     breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
     trials = [
@@ -279,73 +254,68 @@ def solve_steps(
     steps: Steps,
     *,
     start: Any,
-    method: Collocation | None = None,
-    options: Mapping[str, Any] | None = None,
-    tolerances: Mapping[str, float] | None = None,
-    time_limit: float | None = None,
     cost: StepWeights | None = None,
     limits: Limits | None = None,
+    settings: SolveSettings | None = None,
 ) -> Solution:
-    """Plan the footsteps of a legged machine and audit the plan; refine the mesh until a plan is feasible.
+    """Plan the footsteps of `steps_problem` and audit the plan; refine the mesh until a plan is feasible.
 
-    The problem is `steps_problem`. Limits are tightened and meshes refined as in `solve_standing`. The audit of the
-    plan may leave its optimality undetermined. First a coarse mesh shows whether the steps are possible in their
-    durations.
-
-    Args:
-        steps, start, cost, limits: As for `steps_problem`.
-        method: First mesh of each phase; 12 intervals of degree 3 if None.
-        options, tolerances: As for `solve_standing`.
-        time_limit: Seconds after which the planner stops, between two iterations of a solver. None for no limit.
+    The audit may leave the optimality of the plan undetermined.
 
     Raises:
         SolveError: The quickest steps take longer than requested; names the phase and its duration. Or no steps exist
             in any durations; names the conflicting constraints. Or no attempt passes; has the result of each.
         ProblemError: As `steps_problem`.
     """
-    if method is not None:
-        require.instance("method", method, Collocation)
+    solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     require.instance("solve_steps: steps", steps, Steps)
-    settings, step_options = {**IPOPT, **require.mapping("options", options)}, {"cost": cost, "limits": limits}
-    trials: list[Trial] = [(None, method or STEPS)]
-    judge = _Judge(tolerances, lambda _: None)
-    with time_limited(checked_time_limit(time_limit)):
-        guess = guess_in_time(steps, start, step_options, settings)
-        return _first_accepted(
-            lambda _: steps_problem(steps, start=start, cost=cost, limits=limits), trials, settings, judge, guess
-        )
+    guess = guess_in_time(steps, start, {"cost": cost, "limits": limits}, solving.ipopt_options)
+    judge = partial(_audited, solving.tolerances, lambda _: None)
+    trials: list[Trial] = [(None, solving.method or STEPS)]
+    return _first_accepted(
+        lambda _: steps_problem(steps, start=start, cost=cost, limits=limits),
+        trials,
+        solving.ipopt_options,
+        judge,
+        guess,
+    )
+
+
+def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
+    """Return the times at which tasks have kinks or jumps, as fractions of the horizon."""
+    tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
+    times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
+    return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def _first_accepted(
     declare: Callable[[Level | None], Problem],
     trials: Sequence[Trial],
     settings: Mapping[str, Any],
-    judge: _Judge,
+    judge: Callable[..., Attempt],
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
     """Try formulations and meshes in turn, and return the first plan that the audit accepts; raise SolveError or
     ProblemError if there is none, or if collisions are all that is wrong with a plan.
     """
-    reasons: list[str] = []
-    failure = SolveError()
-    refused: list[ProblemError] = []
-    last: Solution | None = None
+    reasons, refused = list[str](), list[ProblemError]()
+    failure, last = SolveError(), None
     for level, mesh in trials:
+        label = "" if level is None else f"tip {level}, "
         try:
             problem = declare(level)
         except ProblemError as error:  # one formulation may leave freedom where the other leaves none
             refused.append(error)
-            reasons.append(f"{_label_of_level(level)}{error}")
+            reasons.append(f"{label}{error}")
             if len(refused) == len(trials):
                 raise refused[0] from None
             continue
         diagnosed = guess is None and level == trials[-1][0]
-        for attempt in _attempts(problem, level, mesh, settings, judge, guess, diagnosed=diagnosed):
+        for name, attempt in _attempts(problem, mesh, settings, judge, guess, diagnosed=diagnosed):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
-            last = attempt.solution or last
-            reasons.append(f"{attempt.name}: {attempt.failure}")
-            failure = attempt.failure or failure
+            last, failure = attempt.solution or last, attempt.failure or failure
+            reasons.append(f"{label}{name}: {attempt.failure}")
     raise SolveError(
         "no standing plan passes its audit:\n" + "\n".join(reasons), last, failure.conflicts,
         name=failure.name, value=failure.value, limit=failure.limit, time=failure.time,
@@ -365,62 +335,54 @@ def _formulations(control: str, free_time: bool, method: Collocation | None) -> 
 
 def _attempts(
     problem: Problem,
-    level: Level | None,
     mesh: Collocation | MultipleShooting,
     settings: Mapping[str, Any],
-    judge: _Judge,
+    judge: Callable[..., Attempt],
     guess: Solution | Mapping[str, Any] | None,
     *,
     diagnosed: bool,
-) -> Iterator[Attempt]:
-    """Solve one formulation on finer and finer meshes and yield each attempt; the caller stops at an accepted one.
+) -> Iterator[tuple[str, Attempt]]:
+    """Yield attempts by name on finer and finer meshes; the caller stops at an accepted one.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
     for k in range(MESHES):
-        name = f"{_label_of_level(level)}{mesh.intervals} intervals"
-        first = diagnosed and k == 0
+        name, first = f"{mesh.intervals} intervals", diagnosed and k == 0
         attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
-        yield attempt
+        yield name, attempt
         guess = attempt.solution
         if attempt.solution is None or not attempt.solution.success or time_left() <= 0:
             return
         if attempt.exceeded:
             tightened = partial(tighten, problem, mesh, options=settings, guess=guess)
-            yield judge(f"{name}, tightened", problem, tightened)
+            yield f"{name}, tightened", judge(f"{name}, tightened", problem, tightened)
         mesh = mesh.halve()
 
 
-def _label_of_level(level: Level | None) -> str:
-    return "" if level is None else f"tip {level}, "
-
-
-@dataclass(frozen=True)
-class _Judge:
-    """Callable that runs a solver, audits the resulting plan, and accepts or rejects it; `pose_error` rejects plans
-    that pass their audit but leave their tasks.
-    """
-
-    tolerances: Mapping[str, float] | None
-    pose_error: Callable[[Audit], SolveError | None]
-
-    def __call__(self, name: str, problem: Problem, run: Callable[[], Solution]) -> Attempt:
-        try:
-            solution = run()
-        except SolveError as error:
-            return Attempt(name, error.solution, error)
-        if not solution.success:
-            if solution.status is SolverStatus.INTERRUPTED:
-                raise SolveError(f"interrupted during the solve with {name}", solution, name=name)
-            ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
-            return Attempt(name, solution, ended)
-        audit = solution.audit(tolerances=self.tolerances)
-        if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
-            if collision := collision_error(audit, solution):
-                raise collision
-            exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            return Attempt(name, solution, audit_error(audit, solution), exceeded)
-        return Attempt(name, solution, self.pose_error(audit))
+def _audited(
+    tolerances: Mapping[str, float] | None,
+    pose_error: Callable[[Audit], SolveError | None],
+    name: str,
+    problem: Problem,
+    run: Callable[[], Solution],
+) -> Attempt:
+    """Run a solver and audit the plan; `pose_error` rejects plans that pass but leave their tasks."""
+    try:
+        solution = run()
+    except SolveError as error:
+        return Attempt(error.solution, error)
+    if not solution.success:
+        if solution.status is SolverStatus.INTERRUPTED:
+            raise SolveError(f"interrupted during the solve with {name}", solution, name=name)
+        ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
+        return Attempt(solution, ended)
+    audit = solution.audit(tolerances=tolerances)
+    if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
+        if collision := collision_error(audit, solution):
+            raise collision
+        exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
+        return Attempt(solution, audit_error(audit, solution), exceeded)
+    return Attempt(solution, pose_error(audit))
 
 
 def _error_of_tips(
@@ -429,8 +391,7 @@ def _error_of_tips(
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""
     progress = audit.states["path"][:, 0] if along_parameter else audit.t
     errors = np.abs(task_errors(machine, tasks, progress, audit.states["joints"])).max(axis=0)
-    parts = bind(machine, tasks).bound
-    gaps = np.repeat([part.task.start_gap for part in parts], [part.task.size for part in parts])
+    gaps = bind(machine, tasks).by_row(lambda task: task.start_gap)
     if (errors > np.maximum(gaps, POSE_TOLERANCE)).any():
         words = f"a tip deviates from its task by {errors.max():.2g} (m or rad)"
         return SolveError(words, name="tip", value=errors.max())

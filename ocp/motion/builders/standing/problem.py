@@ -1,28 +1,9 @@
 """Least-cost motions of a machine that stands on the ground, performs tasks with its tips, and must not tip over.
 
 This is the planned counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial,
-and any tasks: positions, orientations, free tool axes, several arms. Joint accelerations (or jerks) are the control.
-The tips are kept to their tasks in one of two ways:
-
-tip_level "position": for controls held over intervals or linear in them, that is `MultipleShooting(...,
-    control="held")` or `"linear"`, and `Collocation(..., control="held")`. The tip is on its path at the nodes. Loads
-    of ground and joints are constrained at both ends of every interval, a pinned zero moment point at the start of
-    every interval. Held controls converge with first order in the interval where a constraint of the ground is active.
-    The audit then finds the motion feasible, but its cost above the tolerance for an optimum. Linear controls are
-    closer to plans that switch; solve with `ocp.tighten`.
-tip_level "acceleration": for controls at the collocation points, `Collocation(...)`, Legendre rather than Radau. The
-    tip's acceleration is that of the path, and its position follows as accurately as the dynamics are integrated. For
-    the same number of intervals it is much closer to the optimum, and certified by the audit. Choose it where prismatic
-    joints move the tip along straight lines: with "position" the tip oscillates between the nodes there, or does not
-    come to rest on the grid (try one interval more). It does not suit plans that switch, such as those of least time,
-    since the polynomials oscillate within an interval that contains a switch.
-
-Limits hold at the points of the grid; `ocp.tighten(problem, method)` instead of `solve` enforces those of joints and
-ground between the points as well. With a fine enough grid both ways keep the tip within 1e-5 m of its path between the
-points: 40 intervals for collocation and 80 for held controls in the paper's tasks. A zero moment point that is pinned
-or follows a reference is then within 1 mm of it with "acceleration", and with "position" if the jerk is the control.
-With held accelerations it deviates by 5 mm, because it jumps with them. `ocp.motion.builders.standing.plan` chooses
-among all this.
+and any tasks. Joint accelerations (or jerks) are the control. Limits hold at the points of the grid;
+`ocp.tighten(problem, method)` instead of `solve` enforces those of joints and ground between the points as well.
+`ocp.motion.builders.standing.plan` chooses formulation and mesh.
 """
 
 from __future__ import annotations
@@ -97,6 +78,15 @@ class Weights:
 class StandingSetup:
     """Settings of `standing_problem` that most motions leave at their defaults.
 
+    With tip_level "position" the tip is on its path at the nodes. It suits plans that switch, with controls held over
+    intervals or linear in them, `MultipleShooting(..., control="held")` or `"linear"`. Held controls converge with
+    first order where a constraint of the ground is active: the audit finds the motion feasible, but its cost too high.
+
+    With tip_level "acceleration" the tip's acceleration is that of the path. It suits smooth plans with controls at the
+    points of `Collocation(...)`, Legendre rather than Radau: they are much closer to the optimum for the same number of
+    intervals. Choose it where prismatic joints move the tip along straight lines, between whose nodes the tip
+    oscillates with "position".
+
     Attributes:
         start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
         end: Joint positions at the end, nan where free; all are free if None. Shape (n,), rad or m.
@@ -104,10 +94,10 @@ class StandingSetup:
         control: "acceleration" or "jerk".
         along: Argument of the tasks: "time", or "parameter" from 0 to 1 with velocities per unit of it. A free final
             time needs "parameter", or tasks that suit any horizon.
-        tip_level: What the path constraint "tip" constrains. "position": the poses (m; sines of angles), and the
-            velocities of velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone
-            can close a gap at the start; what is left of the gap at the end still moves the joints.
-        clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
+        tip_level: What the constraint "tip" prescribes. "position": the poses (m; sines of angles), and velocities of
+            velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone can close a
+            gap at the start.
+        clearance_constraints: Collision avoidance; None for none.
         symbols: casadi.SX, or casadi.MX if a task, `external` or a reference calls an interpolant.
     """
 
@@ -166,28 +156,19 @@ def standing_problem(
 
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
-    0, and the control "path_acceleration". The path constraints are
-
-    - "tip", see `StandingSetup.tip_level`;
-    - "zero moment point", m; with InFoot the distance from the edges of the foot less the margin;
-    - "foot", the distance from edges that another rule leaves open, m;
-    - "vertical force", N;
-    - "friction", squared friction limit less squared tangential force, over the squared weight;
-    - "torques".
+    0, and the control "path_acceleration". The path constraints are "tip", see `StandingSetup.tip_level`; "zero moment
+    point", m, with InFoot the distance from the edges of the foot less the margin; "foot", the distance from edges that
+    another rule leaves open, m; "vertical force", N; "friction", squared friction limit less squared tangential force,
+    over the squared weight; and "torques". The guess is a local motion.
 
     Args:
-        machine: Standing machine.
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
         start: Start configuration. Shape (n,), rad or m.
         zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
-        weights: Weights of the parts of the cost.
-        limits: Limits of joints and ground.
-        setup: Both ends, external wrenches, control, formulation and clearance; the defaults if None.
-
-    Returns:
-        The problem, with a local motion as its guess.
+        weights, limits: Weights of the parts of the cost; limits of joints and ground.
+        setup: Both ends, external wrenches, control, formulation and clearance.
 
     Raises:
         ProblemError: Sizes, rows or options do not fit; the start is outside the limits; a task does not begin at its
@@ -248,17 +229,12 @@ def standing_problem(
     progress: tuple[Any, ...] = (problem.time,)
     if along_parameter:
         progress = _declare_progress(problem, rests, guess)
-    _constrain_tips(problem, equations, motion, progress, tip_level, not rests[0])
-
+    none = ca.DM(0, 1)
+    constrain_tips(problem, equations, (none, *motion), progress, moving=not rests[0], level=tip_level)
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
     _constrain_ground(problem, machine, motion, wrenches, zmp, limits)
-    effort = bounds.torque
-    if np.isfinite(effort).any():
-        limited = np.flatnonzero(np.isfinite(effort)).tolist()
-        torques = machine.joint_torques(*motion, wrenches)[limited]
-        problem.path("torques", torques, lower=-effort[limited], upper=effort[limited], unit=machine.robot.effort_unit)
+    limit_torques(problem, machine.robot, machine.joint_torques(*motion, wrenches), bounds.torque)
 
-    none = ca.DM(0, 1)
     if setup.clearance_constraints is not None:
         known = None if isinstance(horizon, FreeTime) else duration
         setup.clearance_constraints.declare(problem, none, horizon=known)
@@ -272,27 +248,30 @@ def standing_problem(
     return problem
 
 
-def _constrain_tips(
+def constrain_tips(
     problem: Problem,
     equations: TaskEquations,
-    motion: tuple[Any, Any, Any],
+    motion: tuple[Any, Any, Any, Any],
     progress: tuple[Any, ...],
-    tip_level: str,
+    *,
     moving: bool,
+    level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the poses or accelerations of their tasks, and to velocities at a `moving` start."""
-    none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
+    """Constrain the tips to the accelerations of their tasks, and to velocities at a `moving` start, or only to poses.
+
+    `motion` has base, joint positions, rates and accelerations.
+    """
     targets = equations.targets(*progress[:2])
-    if tip_level == "position":
-        gap = equations.gap(none, joints, velocities, targets)
+    if level == "position":
+        gap = equations.gap(*motion[:3], targets)
         problem.path("tip", gap, lower=0, upper=0, unit=equations.unit(""), tolerance=equations.tolerances)
         return
     if moving:
-        residual = equations.residual(none, joints, velocities, targets)
+        residual = equations.residual(*motion[:3], targets)
         problem.start("tip velocity", residual, lower=0, upper=0, unit=equations.unit())
-    gap = equations.acceleration(none, joints, velocities, accelerations, progress=progress)
+    gap = equations.acceleration(*motion, progress=progress)
     problem.path("tip", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
-    for name, deviation in equations.deviations(none, joints, velocities, targets).items():
+    for name, deviation in equations.deviations(*motion[:3], targets).items():
         problem.watch(name, **deviation)
 
 
@@ -316,13 +295,8 @@ def declare_joints(
 ) -> tuple[Any, Any, Any, Any]:
     """Declare joint positions, velocities and accelerations within limits, and jerks if `jerk`; return the symbols.
 
-    The last of these quantities is the control, the others are states, whose derivatives are declared.
-
-    Args:
-        problem, robot, bounds: Problem, robot, and the limits of its joints.
-        guess: Guesses by the names "joints", "velocities" and "accelerations".
-        starts, ends: Positions, velocities and accelerations at both ends of the motion; None, or nan, where free.
-        scales: Scales of the four quantities for the solver.
+    The last of these quantities is the control, the others are states, whose derivatives are declared. `starts` and
+    `ends` are their values at both ends, None or nan where free, `scales` those for the solver.
     """
     lower = (bounds.lower, -bounds.velocity, -bounds.acceleration, -bounds.jerk)
     upper = (bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk)
@@ -338,6 +312,13 @@ def declare_joints(
         problem.dynamics(state, derivative)
     joints, velocities, accelerations, *jerks = symbols
     return joints, velocities, accelerations, jerks[0] if jerk else ca.DM(0, 1)
+
+
+def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:
+    """Declare the torque limits of a robot's joints, where these are finite, as a path constraint."""
+    if rows := np.flatnonzero(np.isfinite(largest)).tolist():
+        bounds = {"lower": -largest[rows], "upper": largest[rows]}
+        problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)
 
 
 def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:

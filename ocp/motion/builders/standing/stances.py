@@ -60,17 +60,11 @@ class StancePhase:
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """Motion of a foot through the air during a phase.
-
-    Attributes:
-        name: Name of the foot.
-        lifted: Foothold that it left; None if it was never held before.
-        landing: Foothold on which it lands at the end of the phase; None if it does not land then.
-    """
+    """Motion of a foot through the air during a phase."""
 
     name: str
-    lifted: Foothold | None
-    landing: Foothold | None
+    lifted: Foothold | None  # foothold that it left; None if it was never held before
+    landing: Foothold | None  # foothold on which it lands at the end of the phase; None if it does not land then
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +211,7 @@ def walk(
     return tuple(phases)
 
 
-PLACEMENT_TOLERANCE = 1e-6
-"""Largest accepted gap between a foot and its foothold at the start, m or rad."""
+PLACEMENT_TOLERANCE = 1e-6  # largest accepted gap between a foot and its foothold at the start, m or rad
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
@@ -227,9 +220,7 @@ class ConfigurationSettings:
     """Settings of the search for a standing configuration."""
 
     near: float = 1.0  # weight of a joint's squared distance from its initial position, 1/rad^2
-    # weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of a
-    # radian
-    over: float = 300.0
+    over: float = 300.0  # weight of the squared distance of the center of mass from its goal, 1/m^2
     gap: float = 1e-9  # largest gap between a foot and its foothold, m or rad
     steps: int = 40  # number of time steps in the guess of a phase
 
@@ -238,12 +229,7 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: Mapping[str, Foothold] | None = None) -> TaskEquations:
-    """Return task equations that keep feet on footholds, for the pose components that the joints can change.
-
-    Args:
-        stance: Model of the machine with at least two feet on the ground, rooted at the first of them.
-        footholds: Footholds by foot, without the first foot of the stance; None for all other feet of the stance.
-    """
+    """Return task equations that keep feet on footholds, by default all feet but the first, as far as joints can."""
     if footholds is None:
         footholds = {name: stance.footholds[name] for name in stance.other_feet}
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
@@ -320,13 +306,9 @@ def check_placed(stance: Stance, joints: Array) -> None:
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Return initial guesses of the joint positions, velocities and accelerations in each phase.
+    """Return initial guesses of the joint positions, velocities and accelerations in each phase, in its stance's order.
 
-    The guesses of a phase are in the joint order of its stance.
-
-    Args:
-        start: Start configuration, in the robot's joint order.
-        lift: Height of a foot above the line between its footholds, halfway, m.
+    Halfway, a foot is by `lift`, m, above the line between its footholds. `start` is in the robot's joint order.
     """
     ends, guesses = [start], []
     for k in range(1, len(steps.phases) + 1):

@@ -44,11 +44,7 @@ STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """Return the start configuration; a joint that exceeds a limit only by rounding is set to the limit. Shape (n,).
-
-    Raises:
-        ProblemError: A joint starts outside its limits, or has no range between them.
-    """
+    """Return the start configuration (n,); a joint that exceeds a limit only by rounding is set to the limit."""
     for name, value, low, high in zip(machine.robot.joint_names, joints, lower, upper, strict=True):
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
@@ -60,11 +56,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than the machine has.
-
-    Args:
-        size: Number of rows of all tasks.
-    """
+    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than there are."""
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
     left = machine.joint_size - (size + pinned - along_parameter)
     follows = tip_level == "acceleration" and not pinned  # the joints come to rest with the tip
@@ -100,47 +92,35 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError if no joint accelerations satisfy the limits of torque and ground reaction at the start.
+    """Raise ProblemError if no joint accelerations from rest satisfy the limits of torque and ground reaction.
 
-    The machine starts from rest. Torques, vertical force and zero moment point are linear in the accelerations. A
-    linear program finds the least violation.
-
-    Args:
-        machine, joints, wrenches: Machine, configuration and external wrenches at the start.
-        zmp, least_force, bounds: Limits, see standing_problem.
-        demand: Matrix T and vector a of the tasks' equations T q'' = a of the accelerations q''; None without tasks.
+    Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
+    violation. `demand` has matrix T and vector a of the tasks' equations T q'' = a of the accelerations q''.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)
     qdd = ca.SX.sym("qdd", n)
     reaction = machine.ground_reaction(joints, rest, qdd, wrenches)
     torques = machine.joint_torques(joints, rest, qdd, wrenches)
     effort = bounds.torque
-    rows = [
-        (torques[i] / effort[i], f"the torque of {name!r}, at most {effort[i]:g} N m (N)")
+    rows = [  # value, least and largest value, name of the limit
+        (torques[i] / effort[i], -1.0, 1.0, f"the torque of {name!r}, at most {effort[i]:g} N m (N)")
         for i, name in enumerate(machine.robot.joint_names)
         if np.isfinite(effort[i])
     ]
-    low, high = [-1.0] * len(rows), [1.0] * len(rows)
-    sides = [(reaction[5] / least_force, f"the vertical force, at least {least_force:g} N")]
-    low.append(1.0)
+    rows.append((reaction[5] / least_force, 1.0, np.inf, f"the vertical force, at least {least_force:g} N"))
+    scale = machine.weight * machine.support.half_widths.max()
     for normal, offset in _edges(machine, zmp):
         moment = normal[0] * -reaction[1] + normal[1] * reaction[0] - offset * reaction[5]
-        scale = machine.weight * machine.support.half_widths.max()
-        sides.append((moment / scale, "the place of the zero moment point"))
-        low.append(0.0)
-    high += [np.inf] * len(sides)
-    rows += sides
-    values = ca.vertcat(*(value for value, _ in rows))
-    function = ca.Function("start", [qdd], [ca.densify(values), ca.densify(ca.jacobian(values, qdd))])
+        rows.append((moment / scale, 0.0, np.inf, "the place of the zero moment point"))
+    values, low, high, names = zip(*rows, strict=True)
+    column = ca.vertcat(*values)
+    function = ca.Function("start", [qdd], [ca.densify(column), ca.densify(ca.jacobian(column, qdd))])
     at_rest, slopes = (np.array(part) for part in function(rest))
     violations = _least_violations(at_rest.ravel(), slopes, np.array(low), np.array(high), bounds.acceleration, demand)
     if violations is None or violations.max(initial=0.0) <= STARTS.violation:
         return
-    words = [
-        f"{limit}, by {100 * share:.3g} %"
-        for (_, limit), share in zip(rows, violations, strict=True)
-        if share > STARTS.violation
-    ]
+    shares = zip(names, violations, strict=True)
+    words = [f"{limit}, by {100 * share:.3g} %" for limit, share in shares if share > STARTS.violation]
     message = (
         f"start {np.round(joints, 4).tolist()}: no joint accelerations satisfy the limits there: "
         f"{'; '.join(words)}; start elsewhere, load the tip less, or relax the limits"

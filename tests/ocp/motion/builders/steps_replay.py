@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from models import Robot, Support, simplify
-from ocp.motion.builders.standing.resolved import StepsMotion
+from ocp.motion.builders.standing.steps import StepsMotion
 from tests.models.robot.trees import Array
 
 SERVO = 2000.0  # N m/rad

@@ -69,7 +69,7 @@ from ocp import (
     steps_problem,
     walk,
 )
-from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings
 from ocp.motion.builders.space.capture import solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.tasks.tracks import path_tracks, pose_line
@@ -567,20 +567,6 @@ DYNAMICS = [
         for name, function in (("solve_capture", solve_capture), ("chained_capture", chained_capture))
     ),
     Case(
-        "solve_dynamics",
-        lambda **options: solve_dynamics(**with_setup_of(SolveSettings, "settings", options)),
-        {**MOVED, "tasks": Goal(joints=[0.3, 0.2, 0.1])},
-        {
-            "machine": INSTANCE | {"standing": STANDING},
-            "horizon": HORIZON,
-            "tasks": but(INSTANCE, "list", "dictionary") | {"a joint too few": Goal(joints=[0.3, 0.2])},
-            "settings": but(INSTANCE, "None"),
-            "method": but(INSTANCE, "None") | {"indirect": Indirect()},
-            "options": MAPPING,
-            "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},
-        },
-    ),
-    Case(
         "joint_torques",
         lambda machine: joint_torques(machine, ((), ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("a", 3))),
         {"machine": ARM},
@@ -639,10 +625,11 @@ STEPS = [
     Case("steps_problem", steps_problem, STEPPED, STEP_OPTIONS),
     Case(
         "solve_steps",
-        solve_steps,
+        lambda **options: solve_steps(**with_setup_of(SolveSettings, "settings", options)),
         STEPPED,
         {
             **STEP_OPTIONS,
+            "settings": but(INSTANCE, "None"),
             "method": but(INSTANCE, "None") | {"indirect": Indirect()},
             "options": MAPPING,
             "tolerances": MAPPING | {"unknown": {"nothing": 1.0}},

@@ -38,8 +38,9 @@ from ocp import (
     dynamics_phases,
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
+from ocp.motion.builders.dynamics_plan import SolveSettings
 from tests.ocp.motion.builders.test_dynamics import DISPLACEMENT, MASS, slider, torques_along
+from tests.ocp.motion.goal_solves import solve_goals
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
 START, END = np.array([0.0, 0.3]), np.array([1.0, -0.5])
@@ -88,7 +89,7 @@ def least_time_along(s: Array, at: Array) -> float:
 
 @pytest.fixture(scope="module")
 def fastest() -> Solution:
-    return solve_dynamics(MACHINE, GOAL, SOON, start=START, limits=Limits(torque=MOST), cost=LEAST_TIME)
+    return solve_goals(MACHINE, GOAL, SOON, start=START, limits=Limits(torque=MOST), cost=LEAST_TIME)
 
 
 def fine(plan: Solution, times: int = 4001) -> Array:
@@ -141,9 +142,9 @@ def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
     request: dict[str, Any] = {"limits": Limits(torque=MOST, velocity=most)}
     effort = Cost(velocity=0.0, effort=1e-4, time=1.0)
-    best = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=effort, **request)
+    best = solve_goals(MACHINE, GOAL, SOON, start=START, cost=effort, **request)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=effort, settings=SolveSettings(method), **request)
+    plan = solve_goals(MACHINE, GOAL, SOON, start=START, cost=effort, settings=SolveSettings(method), **request)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -157,8 +158,8 @@ def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
     request: dict[str, Any] = {"limits": Limits(torque=MOST)}
-    mixed = solve_dynamics(MACHINE, GOAL, SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **request)
-    easy = solve_dynamics(MACHINE, GOAL, mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **request)
+    mixed = solve_goals(MACHINE, GOAL, SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **request)
+    easy = solve_goals(MACHINE, GOAL, mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **request)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5
@@ -167,7 +168,7 @@ def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
 
 def test_excessive_values_are_refused_by_name() -> None:
     with pytest.raises(SolveError, match="torques of 'joint1' would have to go") as caught:
-        solve_dynamics(
+        solve_goals(
             MACHINE,
             GOAL,
             0.4,
@@ -186,7 +187,7 @@ def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     """A mass that passes 0.5 m at a free time on its way to 0.8 m: no dearer than straight on, which does so too."""
     passed = Goal(joints=[0.5], duration=FreeTime(0.1, 1.0, 0.6), velocity="free")
     last = Goal(joints=[0.8], duration=FreeTime(0.1, 1.0, 0.4))
-    plan = solve_dynamics(slider(), [passed, last], 1.0, start=[0.0])
+    plan = solve_goals(slider(), [passed, last], 1.0, start=[0.0])
     assert plan.cost == pytest.approx(12 * MASS**2 * DISPLACEMENT**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
@@ -202,7 +203,7 @@ def test_a_floating_machine_that_picks_up_a_load_at_rest_keeps_its_momentum() ->
     loaded = FreeFloating(with_load(robot, robot.tip_link, 2.0, (0.4, 0, 0)), "planar")
     load = Goal(joints=[1.2, -0.4], duration=1.0, name="reach")
     place = Goal(joints=[0.2, 0.5], duration=1.5, machine=loaded, name="carry")
-    plan = solve_dynamics(alone, [load, place], start=[0.2, 0.5])
+    plan = solve_goals(alone, [load, place], start=[0.2, 0.5])
     assert plan.audit().passed
     reach, carry = plan.phase("reach"), plan.phase("carry")
     assert carry["base"][0] == pytest.approx(reach["base"][-1], abs=1e-8)
@@ -249,7 +250,7 @@ def test_colliding_pairs_on_the_path_to_a_goal_are_separated() -> None:
 
     def way(clearance_constraints: ClearanceConstraints | None) -> Array:
         """Of the tip, there and back. Shape (402, 3)."""
-        plan = solve_dynamics(
+        plan = solve_goals(
             machine,
             legs,
             start=START,

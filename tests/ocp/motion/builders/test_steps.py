@@ -15,10 +15,19 @@ import pytest
 
 from models import Foot, Foothold, Joint, Link, Robot, Stance, rectangle
 from ocp import Collocation, Limits, ProblemError, Solution, SolveError, solve
+from ocp.console import time_limited
+from ocp.motion.builders.dynamics_plan import SolveSettings
 from ocp.motion.builders.standing.plan import guess_in_time, solve_steps
-from ocp.motion.builders.standing.resolved import StepsMotion, motion_of, resolve_steps, sample_stance, steps_motion
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
-from ocp.motion.builders.standing.steps import StepWeights, steps_problem
+from ocp.motion.builders.standing.steps import (
+    StepsMotion,
+    StepWeights,
+    motion_of,
+    resolve_steps,
+    sample_stance,
+    steps_motion,
+    steps_problem,
+)
 from ocp.problem.formulation import Formulation
 from scripts.robots.steps import SIDES, crouched, planar_biped, planar_feet, planar_steps
 from scripts.robots.talos import talos_steps
@@ -36,7 +45,7 @@ GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
 
 def planned(steps: Steps, method: Collocation | None = None, **request: Any) -> tuple[Solution, StepsMotion]:
     steps = with_margin(steps, **request)
-    plan = solve_steps(steps, start=crouched(steps), method=method, **GROUND)
+    plan = solve_steps(steps, start=crouched(steps), settings=SolveSettings(method), **GROUND)
     return plan, steps_motion(steps, plan)
 
 
@@ -180,7 +189,7 @@ def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
     phases = [StancePhase({"base": base}, 1.5), StancePhase({"base": base, "hand": dock}, 1.0)]
     steps = Steps(robot, feet, phases, margin=0.01)
     mesh = Collocation(10, degree=3, scheme="legendre")
-    plan = solve_steps(steps, start=start, method=mesh, limits=Limits(friction=FRICTION))
+    plan = solve_steps(steps, start=start, settings=SolveSettings(mesh), limits=Limits(friction=FRICTION))
     motion = steps_motion(steps, plan)
     assert plan.audit().feasible
     docked = motion.phase == 1
@@ -266,8 +275,8 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     configuration = standing_configuration(stance, crouched(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
     still = np.zeros_like(configuration)
     one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
-    result = sample_stance(one, one.stances[0], (configuration, still, still), {})
-    return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **result}])
+    motion = (configuration, still, still)
+    return motion_of(one, [sample_stance(one, 0, np.array([0.0, seconds]), motion, foot_loads={})])
 
 
 @pytest.mark.long
@@ -334,8 +343,9 @@ def test_infeasible_steps_are_refused_with_the_constraint_to_relax() -> None:
     steps = planar_steps(1, 0.5, 0.6)
     joints = tuple(replace(joint, effort=3.0) for joint in steps.robot.joints)
     weak = replace(steps, robot=replace(steps.robot, joints=joints))
+    settings = SolveSettings(options={"max_iter": 100})
     with pytest.raises(SolveError, match="no steps were found in any durations") as refusal:
-        solve_steps(with_margin(weak), start=crouched(weak), options={"max_iter": 100}, **GROUND)
+        solve_steps(with_margin(weak), start=crouched(weak), settings=settings, **GROUND)
     error = refusal.value
     assert error.conflicts
     assert error.conflicts[0].label == error.name
@@ -358,8 +368,8 @@ def test_steps_near_the_quickest_are_planned_in_the_time_that_they_may_have() ->
     problem = steps_problem(with_margin(steps), start=crouched(steps), **GROUND)
     guess = guess_in_time(with_margin(steps), crouched(steps), GROUND, {})
     assert solve(problem, coarse, guess=guess, options={"max_iter": 300}, check=False).success
-    with pytest.raises(SolveError, match="12 intervals"):
-        solve_steps(with_margin(steps), start=crouched(steps), time_limit=2.0, **GROUND)
+    with time_limited(2.0), pytest.raises(SolveError, match="12 intervals"):
+        solve_steps(with_margin(steps), start=crouched(steps), **GROUND)
 
 
 # ---- two steps -------------------------------------------------------------------------------------------------------

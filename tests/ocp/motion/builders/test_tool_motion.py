@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from models import FixedBase, FreeFloating, Link, planar_chain
 from ocp import Collocation, Limits, ProblemError, TipTask, solve
+from ocp.motion.builders.dynamics import Actuation
 from ocp.motion.builders.tool_motion import ToolMotionSetup, stretches_of, tool_motion_problem
-from ocp.motion.builders.torques import Actuation
 from ocp.motion.tasks.checks import ignorable_joints
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import floating_panda, panda, ur5

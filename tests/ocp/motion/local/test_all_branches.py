@@ -171,7 +171,7 @@ def assert_is_recovered(rows: Any, angles: Any) -> None:
     chain, rng = chain_of(machine), np.random.default_rng(0)
     assume(least_singular_values(machine, rng.uniform(-np.pi, np.pi, (50, 6))).max() > 1e-2)  # six degrees of freedom
     position, rotation = tip_poses(machine, joints)
-    solvers = [elimination_of(chain, ()), IkSolver(machine, limits=False).prepared.arm.solvers[0]]
+    solvers = [elimination_of(chain, ()), IkSolver(machine, limits=False).arm.solvers[0]]
     for solver in solvers:
         if solver is None:
             continue
@@ -226,7 +226,7 @@ def test_at_singular_poses_a_configuration_is_found_and_completeness_is_not_clai
 
 
 def test_an_elimination_is_taken_only_where_no_closed_form_is() -> None:
-    kinds = {name: IkSolver(build(name), limits=False).prepared.arm.solvers[0] for name in ("UR5", "CRX", "Panda")}
+    kinds = {name: IkSolver(build(name), limits=False).arm.solvers[0] for name in ("UR5", "CRX", "Panda")}
     assert {name: isinstance(solver, Elimination) for name, solver in kinds.items()} == {
         "UR5": False,
         "CRX": True,

@@ -33,10 +33,10 @@ from ocp import (
 )
 from ocp.app.check.verdict import check_trajectory
 from ocp.app.files import read_trajectory
-from ocp.motion.builders.dynamics_plan import solve_dynamics
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.families import some
+from tests.ocp.motion.goal_solves import solve_goals
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
@@ -81,7 +81,7 @@ def least_velocities(machine: FixedBase) -> Any:
 
 
 def moved(machine: FixedBase, **options: Any) -> Any:
-    solution = solve_dynamics(machine, Goal(joints=END), 1.0, start=START, **options)
+    solution = solve_goals(machine, Goal(joints=END), 1.0, start=START, **options)
     return solution.cost
 
 
