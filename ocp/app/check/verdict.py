@@ -12,20 +12,18 @@ import numpy as np
 from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing
 from models.checks import Array, real
 from models.shapes.mesh_files import find_mesh
-from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
-from ocp.app.check.interpolation import Rule
-from ocp.app.check.joint_limits import (
-    Row,
-    RowVerdict,
+from ocp.app.check.data_checks import CleanedTrajectory, clean_trajectory, doubtful_times, exchanged_joints
+from ocp.app.check.joint_limits import Fault, Row, RowVerdict, Rule, limit_rows, rest_row
+from ocp.app.check.motion_checks import (
+    clearance_rows,
     effort_rows,
     integrate_base,
-    limit_rows,
     momentum_rows,
-    rest_row,
+    path_rows,
     standing_rows,
     torque_rows,
+    with_wide_limits,
 )
-from ocp.app.check.kinematic_checks import clearance_rows, doubtful_times, exchanged_joints, path_rows, with_wide_limits
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
 from ocp.audit.audit import Audit
@@ -221,12 +219,10 @@ def check_trajectory(
 ) -> Check:
     """Check a joint trajectory of a machine against limits, for collisions, and against the required path of the tip.
 
-    Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
-    accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
-    the tip are evaluated several times between two samples.
-
-    A floating base starts at rest. On a standing machine the ground may not pull, the zero moment point stays in the
-    foot, and the foot does not slip.
+    Between samples the motion is interpolated as controllers do. Positions, velocities, accelerations and jerks are
+    bounded there at all times, and clearance is proven. Torques, the zero moment point and the tip are evaluated
+    several times between two samples. A floating base starts at rest. On a standing machine the ground may not pull,
+    the zero moment point stays in the foot, and the foot does not slip.
 
     Args:
         machine: The machine, or a robot whose base is fixed at the world's origin.
@@ -271,11 +267,9 @@ def check_trajectory(
         check_time()
 
     progress("limits")
-    limit_table, limit_faults, unlimited_orders = limit_rows(
-        motion, robot, cleaned.joints, bounds, share=tolerances.share
-    )
-    add(([*limit_table, rest_row(motion, robot, cleaned.joints)], limit_faults))
-    unchecked += unlimited_orders
+    table, limit_faults, too_short = limit_rows(motion, robot, cleaned.joints, bounds, share=tolerances.share)
+    add(([*table, rest_row(motion, robot, cleaned.joints)], limit_faults))
+    unchecked += too_short
     add(effort_rows(cleaned, robot, bounds, tolerances.share))
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
@@ -283,14 +277,12 @@ def check_trajectory(
         bases = None
         if isinstance(machine, FreeFloating):
             progress("momentum")
-            if cleaned.base is not None and cleaned.base.shape[1] != machine.base_size:
-                words = (
-                    f"the file gives {cleaned.base.shape[1]} entries of the base, the machine has {machine.base_size}"
-                )
-                raise ProblemError(words, name="base", value=cleaned.base.shape[1], limit=machine.base_size)
             if cleaned.base is None:
                 bases, base_rows = integrate_base(machine, motion)
                 rows += base_rows
+            elif (count := cleaned.base.shape[1]) != machine.base_size:
+                words = f"the file gives {count} entries of the base, the machine has {machine.base_size}"
+                raise ProblemError(words, name="base", value=count, limit=machine.base_size)
             else:
                 bases = cleaned.base
                 add(momentum_rows(machine, motion, bases))
@@ -402,13 +394,8 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Audit a plan, check samples of the plan against the limits of the machine, and evaluate its margin.
-
-    Args:
-        plan: The plan.
-        sample: Samples of the plan at the times at which the limits of the machine are checked.
-        name: Name of the plan.
-        settings: Settings of the audit.
+    """Audit a plan, check samples of it against the limits of the machine, and evaluate its margin; `settings` are
+    those of the audit.
     """
     verdict = PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
     return replace(verdict, margin=plan.margin().sentence) if verdict.passed else verdict

@@ -17,8 +17,8 @@ from models import FreeFloating, Machine, Standing
 from models.checks import Array
 from models.machines.standing import center_of_pressure
 from ocp.app.check.data_checks import clean_trajectory
-from ocp.app.check.interpolation import interpolate
-from ocp.app.check.joint_limits import Row, integrate_base, torque_expression
+from ocp.app.check.joint_limits import Row, interpolate
+from ocp.app.check.motion_checks import integrate_base, torque_expression
 from ocp.app.check.verdict import PlanVerdict, audit_rows, verdict_of
 from ocp.app.files import RawTrajectory
 from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from models.checks import Array
-from ocp.app.check.interpolation import Motion
+from ocp.app.check.joint_limits import Motion
 from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
 from ocp.app.view.report import KINDS, bounds_of, curve_samples, limits_in_view

@@ -15,8 +15,7 @@ import numpy as np
 
 from models import Machine
 from models.checks import Array
-from ocp.app.check.interpolation import Motion, interpolate
-from ocp.app.check.joint_limits import Row, RowVerdict
+from ocp.app.check.joint_limits import Motion, Row, RowVerdict, interpolate
 from ocp.app.check.verdict import Check, audit_rows, verdict_of
 from ocp.app.view.appearance import (
     FAULT,
