@@ -213,7 +213,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
     """Return for each task the key of its neighbour, the similar task whose result is its initial guess.
 
     The first task has None; neighbours come first in the order of the dictionary. Ordered by their keys, which looks
-    random, the tasks form generations of 1, 1, 2, 4, 8, ... tasks, and the neighbour of a task is the nearest task of all
+    random, the tasks form generations of 1, 1, 2, 4, 8, ... tasks. The neighbour of a task is the nearest task of all
     earlier generations, in the space of the numbers `names` of a task, each divided by its range. Neighbours thus come
     closer as the tasks get denser, and no chain is longer than log2 of the number of tasks.
 

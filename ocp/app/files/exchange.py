@@ -1,11 +1,8 @@
 """Write joint motions for other systems and read them back: MCAP logs, Rerun, programs of industrial robots.
 
-MCAP is the log format of ROS 2 and Foxglove. Its messages are those of ROS 2, written and read by the package
-`mcap-ros2-support` of the extra `mcap`. They are decoded with the definitions below, never with those of the file. The
-caller passes the module `rerun`; nothing here depends on it.
-
-Programs of industrial robots are URScript (Universal Robots), KRL (KUKA) and RAPID (ABB), see `write_robot_program`.
-Comments in them state which joint each axis moves. `ocp.app.files.trajectory` reads exactly these statements.
+MCAP is the log format of ROS 2 and Foxglove. Its messages are decoded with the definitions below, never with those of
+the file. Programs of industrial robots are URScript (Universal Robots), KRL (KUKA) and RAPID (ABB); comments in them
+state which joint each axis moves. `ocp.app.files.trajectory` reads exactly these statements.
 """
 
 from __future__ import annotations
@@ -119,11 +116,8 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
     """Read joint states or trajectories from a log; return their topic, and time stamp (ns) and fields of each message.
 
-    A stamp is that of the message's header, or the log time if that is zero.
-
-    Args:
-        file: Log as written by ROS 2, in CDR.
-        topic: Name of the topic; None: the only one of these kinds, or `/joint_states`.
+    A stamp is that of the message's header, or the log time if that is zero. Without a topic, it is the only one of
+    these kinds, or `/joint_states`.
 
     Raises:
         ProblemError: The file is missing or no valid log, the topic is unknown, or mcap-ros2-support is not installed.

@@ -26,11 +26,11 @@ from ocp.app.files.safe_files import (
     SUFFIXES,
     FileName,
     children_of,
-    is_number,
     line_error,
     read_lines,
+    read_rows,
     read_tree,
-    split_cells,
+    table_numbers,
 )
 from ocp.errors import ProblemError, require
 from ocp.storage import joint_name, table_joints
@@ -139,29 +139,17 @@ def _read_table(
     file: FileName, columns: Sequence[str] | None, period: float | None, joints: frozenset[str]
 ) -> RawTrajectory:
     """Read a joint trajectory from a text table, such as a CSV."""
-    numbers, texts = [], []
-    for number, text in enumerate(read_lines(file), 1):
-        line = text.partition("#")[0]
-        if line.strip(" "):
-            numbers.append(number)
-            texts.append(line.strip(" "))
-    if not texts:
-        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
-    delimiter = next((sign for sign in ";,\t" if sign in texts[0]), " ")
-    first = split_cells(texts[0], delimiter)
-    if columns is None:
-        if all(is_number(cell or "nan") for cell in first):
-            why = "no header names the columns; name them in order: --columns time,NAME,... (columns=)"
-            raise line_error(file, numbers[0], texts[0], why)
-        head, rows, numbers = first, texts[1:], numbers[1:]
-    else:
-        has_header = not all(is_number(cell or "nan") for cell in first)
-        head, rows, numbers = list(columns), texts[has_header:], numbers[has_header:]
+    rows, _ = read_rows(file)
+    first, has_header = rows[0], rows[0].has_names
+    if columns is None and not has_header:
+        why = "no header names the columns; name them in order: --columns time,NAME,... (columns=)"
+        raise line_error(file, first.number, first.text, why)
+    head, rows = first.cells if columns is None else list(columns), rows[has_header:]
     while head and not head[-1].strip():  # a delimiter at the end of every line
         head = head[:-1]
     if not rows:
         raise ProblemError(f"{file}: the file has a header but no sample", name="file", value=str(file))
-    table = _numbers(file, rows, numbers, delimiter, len(head))
+    table = table_numbers(file, rows, [True] * len(head))
     time, columns_of_values, notes = _meanings(file, head, joints)
     if time is None and period is None:
         words = f"{file}: no column is the time among {', '.join(map(repr, head))}; name one `time`, or give the period"
@@ -176,30 +164,8 @@ def _read_table(
     if values["positions"] is None:
         words = f"{file}: no column is a position among {', '.join(map(repr, head))}; name the columns like the joints"
         raise ProblemError(words, name="positions", value=tuple(head))
-    places: dict[str, Any] = {"lines": np.array(numbers), "notes": tuple(notes), "file": str(file)}
+    places: dict[str, Any] = {"lines": np.array([row.number for row in rows]), "notes": tuple(notes), "file": str(file)}
     return RawTrajectory(names, t, **values, names_are_joints=False, **places)
-
-
-def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers in the rows of a table as an array (M, width), with nan for empty cells."""
-    split = [split_cells(row, delimiter) for row in rows]
-    for row, number, cells in zip(rows, numbers, split, strict=True):
-        if len(cells) != width:
-            while len(cells) > width and not cells[-1]:
-                cells.pop()
-            if len(cells) != width:
-                why = f"{len(cells)} columns, the header has {width}; complete the row"
-                raise line_error(file, number, row, why, limit=width)
-    try:
-        return np.array(split, dtype=float)
-    except ValueError:
-        pass
-    for row, number, cells in zip(rows, numbers, split, strict=True):
-        for k, cell in enumerate(cells):
-            if not is_number(cell or "nan"):
-                raise line_error(file, number, row, f"{cell!r} is not a number; correct it")
-            cells[k] = cell or "nan"
-    return np.array(split, dtype=float)
 
 
 def _meanings(

@@ -1,12 +1,9 @@
 """Create a web page that plays motions and shows their curves and audits, and serve the page on this machine.
 
-The page contains its geometry and scripts, and its policy forbids requests to any host, so that it plays from a file
-without a server. `selfmotion view` serves the same page until Ctrl-C. A request must name this machine as its host,
-which excludes the page of a stranger whose domain resolves to this machine.
-
-Scene and curves are drawn by scripts of our own (ocp/app/view/page/). The clients of viewer libraries also play
-recordings, but they neither report the displayed time nor let it be set, which the time cursor of the curves needs,
-and they are larger than this page.
+The page contains its geometry and scripts (ocp/app/view/page/), and its policy forbids requests to any host, so that it
+plays from a file without a server. Clients of viewer libraries neither report the displayed time nor let it be set,
+which the cursor of the curves needs. A request to the server must name this machine as its host, which excludes the
+page of a stranger whose domain resolves to this machine.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from numpy.typing import NDArray
 from models import Robot
 from models.checks import Array
 from models.spatial import quaternion_from_rotation
+from ocp.app.files.waypoints import align_signs
 from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
@@ -56,12 +54,7 @@ class Buffers:
 
 
 class Page(NamedTuple):
-    """A web page that plays a motion.
-
-    Attributes:
-        text: HTML of the page.
-        missing: Meshes that are not shown, as named in the descriptions, and the reasons.
-    """
+    """A web page that plays a motion: its HTML, and the meshes that are not shown with the reasons."""
 
     text: str
     missing: dict[str, str]
@@ -196,9 +189,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
     """Return the poses of k frames as positions and quaternions, with signs continuous in time. Shape (M, k, 7)."""
     poses = []
     for name in names:
-        quaternions = quaternion_from_rotation(frames.rotations[name])
-        signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-        quaternions[1:] *= np.cumprod(signs)[:, None]
+        quaternions = align_signs(quaternion_from_rotation(frames.rotations[name]))
         poses.append(np.column_stack([frames.positions[name], quaternions]))
     return np.stack(poses, axis=1)
 
@@ -291,11 +282,7 @@ HOST = "127.0.0.1"
 
 
 class PageServer:
-    """Context manager that serves one page by HTTP to browsers on this machine.
-
-    Attributes:
-        address: Address to open in a browser.
-    """
+    """Context manager that serves one page by HTTP at `address` to browsers on this machine."""
 
     def __init__(self, text: str, port: int = 0) -> None:
         """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port.
