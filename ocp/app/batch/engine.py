@@ -56,12 +56,8 @@ _LOCK = threading.RLock()
 
 
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call a function with a task, given as JSON text; return the payload of its result, or of its exception.
-
-    If `with_guess` is true, the result of a similar task, `guess`, is the second argument.
-
-    Raises:
-        WorkerFailure: The disk is full.
+    """Call a function with a task, given as JSON text, and if `with_guess` with the result of a similar task; return
+    the payload of its result, or of its exception. Raise WorkerFailure if the disk is full.
     """
     with _LOCK:
         began = time.perf_counter()
@@ -158,8 +154,7 @@ class EngineSettings:
     Attributes:
         deaths: Number of ended workers after which a task is given up.
         patience: Time after which a scheduler that does not answer is considered lost, s.
-        recount: Time between two counts of the workers, s.
-        closing: Largest time to wait for ended workers at the end of a batch, s.
+        recount, closing: Time between two counts of the workers, and to wait for ended workers at the end, s.
     """
 
     deaths: int = 3

@@ -206,12 +206,7 @@ RECORD_FIELDS = {
 
 
 class ResultStore:
-    """Folder that stores the results of one function, one record for each task.
-
-    Attributes:
-        folder: The folder.
-        function, version: Function that computed the results, and its version.
-    """
+    """Folder that stores the results of one version of one function, one record for each task."""
 
     def __init__(self, folder: Path, function: str, version: str) -> None:
         self.folder, self.function, self.version = folder, function, version

@@ -234,8 +234,8 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
     """Return the unit below 1 s in which sample times give plausible joint speeds, "" if there is none, and a speed.
 
-    The speed is that of the fastest joint, relative to its limit, if the times are in seconds. Plausible are samples at
-    10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
+    It is that of the fastest joint, relative to its limit (or 1), in seconds. Plausible are samples at 10 kHz or less,
+    and a fastest joint at 1 to 1000 % of its limit.
     """
     h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
     used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())

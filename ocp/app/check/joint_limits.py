@@ -1,12 +1,11 @@
 """Interpolate joint samples as controllers do, and check joint limits between the samples.
 
 A file with positions alone is interpolated linearly, one with velocities by cubics (Hermite), and one with
-accelerations by quintics. Where the acceleration of the sampled motion jumps, the interpolant overestimates it: a
-cubic by up to two thirds, a quintic by a sixth. A quantity is therefore compared with a limit only as far as every
-motion through the samples needs it (`Motion.needed`), unless the rule of the controller is stated. Linear interpolation
-has no acceleration: any twice differentiable motion through three samples has the acceleration 2 q[t0, t1, t2] at some
-time between them, and any smoother one the jerk 6 q[t0, t1, t2, t3]. A violation smaller than the rounding error of the
-file's digits is reported but is not a fault.
+accelerations by quintics, which overestimate an acceleration that jumps. A quantity is therefore compared with a limit
+only as far as every motion through the samples needs it (`Motion.needed`), unless the rule of the controller is stated.
+Without velocities, any smooth motion through three samples has the acceleration 2 q[t0, t1, t2] at some time between
+them, and any through four the jerk 6 q[t0, t1, t2, t3]. A violation smaller than the rounding error of the file's
+digits is reported but is not a fault.
 """
 
 from __future__ import annotations
@@ -115,11 +114,8 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
-    """Piecewise polynomials in Bernstein form, whose coefficients enclose them.
-
-    Attributes:
-        t: Break points, increasing. Shape (N + 1,), s.
-        coefficients: Bernstein coefficients. Shape (N, d + 1, n).
+    """Piecewise polynomials between breaks t (N + 1,), s, by their Bernstein coefficients (N, d + 1, n), which enclose
+    them.
     """
 
     t: Array
@@ -184,12 +180,10 @@ class MotionQuantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Samples of a joint motion and the rule of interpolation between them.
+    """Samples of a joint motion at times (M,), s, and the rule of interpolation between them.
 
-    Attributes:
-        t: Sample times, increasing, at least two. Shape (M,), s.
-        q, v, a: Positions, velocities or None, accelerations or None. Shape (M, n).
-        stated: Whether the controller is known to interpolate by this rule, so that the interpolant itself counts.
+    Velocities or accelerations (M, n) may be None. `stated` says that the controller is known to interpolate by this
+    rule, so that the interpolant itself counts.
     """
 
     t: Array
@@ -424,14 +418,8 @@ def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
 class _Side(NamedTuple):
     """Largest values of one quantity of a joint towards its upper or lower limit, in each interval between samples.
 
-    Values and limit are multiplied by `sign`.
-
-    Attributes:
-        sign: 1 for the upper limit, -1 for the lower.
-        limit: The limit.
-        values: Maxima, at most the values that every motion through the samples needs. Shape (N,).
-        time: Time of the largest value, s.
-        eased: Whether the interpolant violates the limit although not every motion through the samples needs to.
+    Values (N,) and limit are multiplied by `sign`: 1 for the upper limit, -1 for the lower. They are at most what every
+    motion through the samples needs; `eased` says that the interpolant violates the limit, but not every such motion.
     """
 
     sign: float

@@ -245,9 +245,8 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
 
 
 def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check that the total momentum is constant under the given base motion; return table rows and faults.
-
-    The velocity of the base is computed by central differences.
+    """Check that the total momentum is constant under the given base motion, by central differences; return table rows
+    and faults.
     """
     if len(motion.t) < 3:
         return [], []

@@ -366,12 +366,9 @@ def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PlanVerdict:
-    """Audit of a plan, and check of the plan's samples against the limits of the machine.
+    """Audit of a plan against its problem, and check of the plan's samples against the limits of the machine.
 
-    Attributes:
-        audit: Audit of the plan against its problem.
-        check: Check of the plan's samples against the machine's limits of joints, velocities and torques.
-        margin: What the plan withstands, as a sentence with the plan as its subject; "" for a plan that fails.
+    `margin` says what the plan withstands, with the plan as its subject; "" for a plan that fails.
     """
 
     audit: Audit
@@ -426,9 +423,8 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check sampled joint positions, rates and accelerations against a robot's limits; the last two may be None.
-
-    `values` has the times (M,), positions, rates and accelerations (M, n).
+    """Check times (M,), sampled joint positions, rates and accelerations (M, n) against a robot's limits; the last two
+    may be None.
     """
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem

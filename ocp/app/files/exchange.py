@@ -169,10 +169,8 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of an MCAP log in file order, including the records inside chunks.
-
-    Raises:
-        ValueError: A record, or the unpacked log, is too large.
+    """Yield the records of an MCAP log in file order, also inside chunks; raise ValueError if a record, or the log, is
+    too large.
     """
     from mcap.exceptions import EndOfFile
     from mcap.records import Chunk
@@ -273,14 +271,11 @@ class RobotLanguage(NamedTuple):
     """Grammar of the programs for the controllers of one maker, as far as selfmotion writes them.
 
     Attributes:
-        title: Name of the language.
-        comment: Sign that begins a comment.
+        title, comment: Name of the language, and sign that begins a comment.
         arm, external: Names of the axes of the robot, and of the external axes.
-        unit: Unit of revolute joints, a key of PROGRAM_UNITS; prismatic joints are in mm.
-        decimals: Number of decimals of joint positions.
+        unit, decimals: Unit of revolute joints, a key of PROGRAM_UNITS (prismatic joints are in mm), and decimals.
         statements: Patterns of the statements in their order, without spaces beside signs. Groups are the positions of
-            the axes, and `time` the duration of a step in s.
-        repeated: Index of the statement that may occur any number of times.
+            the axes, and `time` the duration of a step in s. Statement number `repeated` may occur any number of times.
     """
 
     title: str

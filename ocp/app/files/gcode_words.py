@@ -40,11 +40,7 @@ class ArcError(Exception):
 
 
 def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bool, gap: float) -> Array:
-    """Return the centre (2,), m, of an arc with given ends and radius; a negative radius selects the longer arc.
-
-    Raises:
-        ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
-    """
+    """Return the centre (2,), m, of an arc with given ends and radius; a negative radius selects the longer arc."""
     chord = end - start
     length = float(np.hypot(*chord))
     if length == 0:
@@ -196,12 +192,7 @@ NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the 
 class Block(NamedTuple):
     """Words (letters with numbers) of one line of G-code.
 
-    Attributes:
-        number: Line number in the file, from 1.
-        text: The line as written.
-        codes: G and M words in tenths: ("G", 901) is G90.1.
-        words: Values of all other words by letter.
-        skipped: Whether the line begins with `/`.
+    G and M words are in tenths: ("G", 901) is G90.1. A skipped line begins with `/`. All other words are by letter.
     """
 
     number: int

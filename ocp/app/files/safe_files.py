@@ -99,9 +99,6 @@ def read_rows(file: FileName) -> tuple[list[TableRow], TableRow]:
 
     Commas, semicolons, tabs or blanks separate the cells; with a semicolon, a comma is a decimal point. `#` begins a
     comment.
-
-    Raises:
-        ProblemError: The file cannot be read, or has only comments.
     """
     rows: list[TableRow] = []
     delimiter, comment = "", (0, "", "")
@@ -170,11 +167,8 @@ _NO_KEY = object()
 
 
 def read_tree(file: FileName, kind: str) -> Any:
-    """Return the contents of a JSON file, or of the first document of a YAML file.
-
-    Raises:
-        ProblemError: The file cannot be read, is invalid, or has too many or too deeply nested values; pyyaml is needed
-            and not installed.
+    """Return the contents of a JSON file, or of the first document of a YAML file; raise ProblemError if it is invalid
+    or too large.
     """
     text = "\n".join(read_lines(file, longest=None))
     try:
@@ -322,13 +316,10 @@ SIGNATURES = {
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
-    """Return the path to which an output is written, after checks and with links resolved.
+    """Return the path to which an output is written, with links resolved.
 
-    Args:
-        kind: Kind of the output, a key of SUFFIXES.
-        file: Requested file name.
-        folder: Folder in or below which the output must be; None: anywhere.
-        force: Whether a file that selfmotion did not write may be overwritten.
+    `kind` is a key of SUFFIXES. The output must be in or below `folder`, unless that is None. Only if `force` is set, a
+    file may be overwritten that selfmotion did not write.
 
     Raises:
         ProblemError: The name has a wrong suffix or unprintable characters, is outside of the folder, or belongs to a

@@ -68,12 +68,8 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Contact polygon of a standing machine, and the zero moment points during its motion.
-
-    Attributes:
-        corners: Corners of the contact area. Shape (k, 2), m.
-        points: Zero moment points at the motion's M times. Shape (M, 2), m.
-        forces: Whether the points take external forces into account.
+    """Corners (k, 2), m, of the contact area of a standing machine, zero moment points (M, 2), m, and whether they take
+    external forces into account.
     """
 
     corners: Array
@@ -398,9 +394,8 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """Return the integral of the problem's running cost and every entry of its path constraints as curves.
-
-    The group of an entry is the name of its constraint.
+    """Return the integrated running cost of a problem and every entry of its path constraints, grouped by constraint,
+    as curves.
     """
     if solution.problem is None:
         return []

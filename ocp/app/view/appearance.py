@@ -42,8 +42,7 @@ class SurfaceStyle:
         min_cell: Initial size of the cells in which corners are merged, m; doubled until there are few enough faces.
         crease: Faces that meet at a larger angle are shaded separately, rad.
         max_neighbours: Largest number of faces at a corner that are shaded as one surface.
-        sides: Number of sides of round shapes.
-        rod_radius: Relative to the longest distance between joints.
+        sides, rod_radius: Sides of round shapes; radius of rods, relative to the longest distance between joints.
         patch: Half the side of the drawn part of a plane, relative to the diagonal of what moves in front of it.
     """
 
@@ -66,13 +65,9 @@ Solid = tuple[Array, NDArray[np.intp]]
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A surface of triangles that has one colour and is carried by a link.
+    """A surface of triangles that has one colour (red, green, blue and opacity, 0 to 1) and is carried by a link.
 
-    Attributes:
-        link: Name of the link that carries the surface.
-        vertices, normals: Vertices (m) and unit normals in the frame of the link. Shape (n, 3) each.
-        faces: Indices of the triangles' corners. Shape (f, 3).
-        color: Red, green, blue and opacity, 0 to 1.
+    Vertices (n, 3), m, and unit normals (n, 3) are in the frame of the link, faces (f, 3) are indices of vertices.
     """
 
     link: str
@@ -84,11 +79,8 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """Surfaces with which a robot is displayed, and the meshes that are missing.
-
-    Attributes:
-        parts: Surfaces of all links.
-        missing: Meshes that are not shown, as named in the description, and the reasons.
+    """Surfaces with which a robot is displayed, and the meshes that are not shown, as named in the description, with
+    reasons.
     """
 
     parts: tuple[Part, ...]
@@ -284,11 +276,8 @@ TIP_FRAME = "the tip frame"
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of the links and of the tip in the world along a motion, keyed by link name or TIP_FRAME.
-
-    Attributes:
-        rotations: Axes as columns. Shape (M, 3, 3) each.
-        positions: Origins. Shape (M, 3) each, m.
+    """Frames of the links and of the tip in the world along a motion, by link name or TIP_FRAME: axes as columns (M, 3,
+    3), and origins (M, 3), m.
     """
 
     rotations: dict[str, Array]
@@ -328,14 +317,10 @@ def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
 
 
 class Obstacle(NamedTuple):
-    """An obstacle for display: the convex hull of points inflated by a radius, or a half-space.
+    """An obstacle for display: the convex hull of points (k, 3), m, inflated by a radius, or a half-space.
 
-    Attributes:
-        core: Points. Shape (k, 3), m; for a half-space one point of its plane.
-        radius: Radius by which the hull is inflated, m.
-        normal: Outward normal of a half-space, shape (3,); otherwise None.
-        rotations, positions: Frame of the body in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None
-            if it is static, with points in world.
+    A half-space has one point of its plane and its outward normal. `rotations` (M, 3, 3) and `positions` (M, 3), m, are
+    those of the body in world at the times of a motion; None if it is static, with points in world.
     """
 
     core: Array

@@ -70,12 +70,8 @@ def build_page(
 ) -> Page:
     """Return the page that plays one motion, or a motion and others to compare it with.
 
-    Args:
-        shown: The motions.
-        title: Title of the page; "": the name of the first motion.
-        folders: Folders that are searched first for meshes.
-        meshes: Whether mesh files are read; otherwise collision shapes are shown.
-        workpiece: Vertices in world, m, and triangles of a body that is shown as well. Shapes (k, 3) and (f, 3).
+    `folders` are searched first for `meshes`; without meshes collision shapes are shown. `workpiece` has vertices (k,
+    3) in world, m, and triangles (f, 3) of a body that is shown as well.
 
     Raises:
         ProblemError: There is no motion, or the page is too large.
@@ -131,40 +127,21 @@ def _look_alike(a: Robot, b: Robot) -> bool:
         [(shape.kind, shape.file, tuple(np.ravel(shape.translation))) for link in robot.links for shape in link.visuals]
         for robot in (a, b)
     ]
-    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(a.joints, b.joints, strict=True))
-
-
-def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link, or the root, that carries it, and its rotation and position there."""
-    carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
-    for joint in robot.joints:
-        if joint.moves:
-            carriers[joint.child] = (joint.child, np.eye(3), np.zeros(3))
-            continue
-        carrier, rotation, shift = carriers[joint.parent]
-        carriers[joint.child] = (carrier, rotation @ joint.rotation, shift + rotation @ np.asarray(joint.translation))
-    return carriers
-
-
-def _movers(robot: Robot) -> list[str]:
-    """Return the names of the root and of the moving links, whose frames the page animates."""
-    return [robot.root, *(joint.child for joint in robot.joints if joint.moves)]
+    return looks[0] == looks[1]
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a robot for the page: its surfaces, in the frames of its moving links, with colours."""
-    carriers, movers = _carriers(robot), _movers(robot)
-    parts = []
-    for part in appearance.parts:
-        carrier, rotation, translation = carriers[part.link]
-        parts.append(
-            {
-                "mover": movers.index(carrier),
-                "link": part.link,
-                "color": [round(float(value), 4) for value in part.color],
-                **_surface(part.vertices @ rotation.T + translation, part.normals @ rotation.T, part.faces, buffers),
-            }
-        )
+    """Return the description of a robot for the page: its surfaces, in the frames of its links, with their colours."""
+    movers = [link.name for link in robot.links]
+    parts = [
+        {
+            "mover": movers.index(part.link),
+            "link": part.link,
+            "color": [round(float(value), 4) for value in part.color],
+            **_surface(part.vertices, part.normals, part.faces, buffers),
+        }
+        for part in appearance.parts
+    ]
     return {"name": robot.name, "movers": movers, "parts": parts}
 
 
@@ -200,7 +177,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
     points = np.vstack([*frames.positions.values()])
-    movers = _movers(motion.machine.robot)
+    movers = [link.name for link in motion.machine.robot.links]
     obstacles = []
     for number, obstacle in enumerate(motion.obstacles):
         mover = None
@@ -285,11 +262,7 @@ class PageServer:
     """Context manager that serves one page by HTTP at `address` to browsers on this machine."""
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port.
-
-        Raises:
-            ProblemError: No port is free, or the number is invalid.
-        """
+        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port."""
         self._server = _start_server(text.encode(), port)
         self.address = f"http://{HOST}:{self._server.server_address[1]}"
         self._thread = Thread(target=self._server.serve_forever, name="page", daemon=True)

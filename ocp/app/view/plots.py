@@ -1,7 +1,6 @@
 """Plot plans and solutions with limits, compare them with other motions, and display them in notebooks.
 
-`Plan.plot` and `Solution.plot` call these functions. The figures are matplotlib figures without a window: a notebook
-displays them, and `figure.savefig` writes them. A figure of pyplot can be passed instead.
+The figures are matplotlib figures without a window: a notebook displays them, and `figure.savefig` writes them.
 """
 
 from __future__ import annotations
@@ -122,10 +121,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of curves: as dashed lines if they are near the curves, else as text.
-
-    Curves with a range smaller than `min_range` are drawn as constant.
-    """
+    """Draw the limits of curves, see `limits_in_view`."""
     view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range=min_range)
     for limit in view.lines:
         ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
@@ -220,29 +216,22 @@ def _motion_of(plan: Plan) -> Motion:
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
     """Return the joint motion of an object that is plotted for comparison with a plan, and its cost or None."""
     cost: float | None = None
+    joints = getattr(other, "names", names)
     if isinstance(other, Plan):
-        joints, motion, cost = other.names, _motion_of(other), other.cost
+        motion, cost = _motion_of(other), other.cost
     elif isinstance(other, LocalSolution):
-        joints, motion, cost = names, Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
+        motion, cost = Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
     elif isinstance(other, AccelerationSolution):
-        samples = other.motion
-        joints, motion = (
-            names,
-            Motion(samples.t, samples.joints, samples.joint_velocities, samples.joint_accelerations),
-        )
+        each = other.motion
+        motion = Motion(each.t, each.joints, each.joint_velocities, each.joint_accelerations)
     elif isinstance(other, JointTrajectory):
-        joints, motion = other.names, Motion(other.t, other.positions, other.velocities, other.accelerations)
+        motion = Motion(other.t, other.positions, other.velocities, other.accelerations)
     else:
-        words = (
-            f"plot: {name!r} is a {type(other).__name__}; a plan can be compared with a plan, a result of resolve or "
-            "resolve_accelerations, or a JointTrajectory"
-        )
-        raise ProblemError(words, name="against", value=other)
+        words = f"plot: {name!r} is a {type(other).__name__}; a plan can be compared with a plan, a result of resolve "
+        raise ProblemError(f"{words}or resolve_accelerations, or a JointTrajectory", name="against", value=other)
     if joints != names or motion.q.shape[1] != len(names) or len(motion.t) < 2:
-        words = (
-            f"plot: {name!r} has joints {', '.join(joints)} at {len(motion.t)} times; the plan's: {', '.join(names)}"
-        )
-        raise ProblemError(words, name="against", value=joints, limit=names)
+        words = f"plot: {name!r} has joints {', '.join(joints)} at {len(motion.t)} times; the plan's: "
+        raise ProblemError(words + ", ".join(names), name="against", value=joints, limit=names)
     return motion, cost
 
 
@@ -311,17 +300,12 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(name: str, motion: Any) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution, or of base, joints and rates of a result of
-    `resolve`, by name; raise ProblemError for any other object, which `name` denotes.
-    """
+    """Return the number of entries of each state and control of a solution or of a result of `resolve`, by name."""
     if isinstance(motion, LocalSolution):
         return {entry: values.shape[1] for entry, values in _local(motion).items()}
     if not isinstance(motion, Solution):
-        words = (
-            f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result of "
-            "resolve"
-        )
-        raise ProblemError(words, name="against", value=motion)
+        words = f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result "
+        raise ProblemError(f"{words}of resolve", name="against", value=motion)
     return {entry: values.shape[1] for entry, values in {**motion.states, **motion.controls}.items()}
 
 
@@ -332,9 +316,8 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s) and values of a motion's states and controls by name, including both one-sided values at nodes.
-
-    States and controls of a phase are given over the interval of that phase.
+    """Return times (s), in the interval of its phase, and values of each state and control by name, with both one-sided
+    values at nodes.
     """
     if isinstance(motion, LocalSolution):
         return {name: (motion.t, values) for name, values in _local(motion).items()}
@@ -363,14 +346,12 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
 
 def _motions_by_name(against: Any) -> dict[str, Any]:
     """Return the motions that are compared with a plan or solution, keyed by name."""
-    if against is None:
-        return {}
     if isinstance(against, Mapping):
         named = {str(name): one for name, one in against.items()}
     elif isinstance(against, list | tuple):
         named = {f"other {number}": one for number, one in enumerate(against, 1)}
     else:
-        named = {"the other": against}
+        return {} if against is None else {"the other": against}
     if not named:
         words = f"plot: {against!r} has no motion to compare with; pass a motion, several, or None"
         raise ProblemError(words, name="against", value=against)

@@ -145,13 +145,8 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Horizontal ground with a square grid, which fades with the distance from its centre.
-
-    Attributes:
-        height: Height above the origin of world, m.
-        middle: x and y of the centre, m.
-        radius: Distance from the centre at which the floor has faded, m.
-        grid: Distance between the lines of the grid, m.
+    """Horizontal ground at a height, m, with lines of a square grid, which fades within a radius, m, around its middle
+    (x, y), m.
     """
 
     height: float
@@ -170,9 +165,7 @@ def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """Return the surface of a round tube of a radius, m, and a colour along a line through points (k, 3), m, to draw a
-    path.
-    """
+    """Return the surface of a round tube of a radius, m, and a colour along a line through points (k, 3), m."""
     line = np.asarray(points, dtype=float)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-9 * max(float(np.ptp(line, axis=0).max()), 1e-12)
     line = line[np.append(True, steps)]
@@ -187,15 +180,15 @@ def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
         side /= np.linalg.norm(side)
         sides[k] = side
     count = PICTURE_STYLE.tube_sides
-    angle = np.arange(count) * (2 * np.pi / count)
-    offsets = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * np.cross(tangents, sides)[:, None]
-    rings, columns = (
-        tangent.ravel() for tangent in np.meshgrid(np.arange(len(line) - 1), np.arange(count), indexing="ij")
-    )
-    a, b = rings * count + columns, rings * count + (columns + 1) % count
+    angle = np.arange(count)[:, None] * (2 * np.pi / count)
+    offsets = np.cos(angle) * sides[:, None] + np.sin(angle) * np.cross(tangents, sides)[:, None]
+    corners = np.arange(len(line) * count).reshape(-1, count)
+    a, b = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    inner = a < a.size - count
+    a, b = a[inner], b[inner]
     faces = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
-    flat = offsets.reshape(-1, 3)
-    return Part("", (line[:, None] + radius * offsets).reshape(-1, 3), flat, faces, (*color, 1.0))
+    surface = (line[:, None] + radius * offsets).reshape(-1, 3)
+    return Part("", surface, offsets.reshape(-1, 3), faces, (*color, 1.0))
 
 
 def render(
@@ -324,10 +317,9 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
         begin = end
 
 
-def _blocks(cells: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Yield the given numbers of picture samples in blocks of at most `batch_size`."""
-    size = PICTURE_STYLE.batch_size
-    return (cells[begin : begin + size] for begin in range(0, len(cells), size))
+def _blocks(cells: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the given numbers of picture samples in blocks of at most `batch_size`."""
+    return np.array_split(cells, len(cells) // PICTURE_STYLE.batch_size + 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,14 +69,10 @@ class Report:
     """Contents of an HTML report on a trajectory or a plan.
 
     Attributes:
-        title, verdict: Title and verdict, as texts.
-        passed: Whether the verdict is good.
-        facts: Short facts, such as the duration.
-        faults: Descriptions of the faults.
-        picture: Picture of the motion as a PNG, or b"".
-        plots: Curves of the joints as an SVG.
+        title, verdict, passed: Title, verdict as text, and whether it is good.
+        facts, faults, notes: Short facts, such as the duration, descriptions of the faults, and notes below the tables.
+        picture, plots: Picture of the motion as a PNG, or b"", and curves of the joints as an SVG.
         tables: Title and rows of each table.
-        notes: Notes below the tables.
     """
 
     title: str
