@@ -383,6 +383,7 @@ class PendingTasks:
         store: ResultStore,
         texts: dict[str, str],
         parents: dict[str, str | None],
+        *,
         results: dict[str, Result],
         source: str,
     ) -> None:

@@ -122,7 +122,7 @@ def run_batch(
         try:
             with store.locked():
                 results |= recorded([key for key in texts if key not in results])  # by the driver that held the lock
-                pending = PendingTasks(store, texts, parents, results, source)
+                pending = PendingTasks(store, texts, parents, results=results, source=source)
                 if len(results) < len(texts):
                     if isinstance(cluster, int):
                         cluster = min(cluster, len(texts) - len(results))

@@ -55,7 +55,6 @@ FACTORS = {
     180 / np.pi: "degrees per second",
     np.pi / 180: "radians per second where the positions are degrees",
     30 / np.pi: "turns per minute",
-    1000.0: "",
     1e-3: "per millisecond",
     -1.0: "of the opposite sign",
 }

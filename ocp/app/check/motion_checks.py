@@ -7,7 +7,7 @@ Clearance is proven between the samples if the base stands still.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -47,72 +47,82 @@ INSIDE = np.linspace(0.0, 1.0, 5)
 """Fractions of an interval at which torques and the forces of the ground are evaluated."""
 
 
-def judge(
-    name: str,
-    times: Array,
-    values: Array,
-    limit: float,
-    unit: str,
-    *,
-    fault: tuple[str, str],
-    text: str,
-    details: Mapping[str, Array] = {},
-    least: bool = False,
-    share: float = 0.0,
-    blur: float = 0.0,
-    note: str = "",
-) -> tuple[Row, list[Fault]]:
-    """Compare samples (K,) of a quantity with the limit of its size, or with its least value if `least` is set.
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Samples of a quantity, and the limit of its size, or its least value.
 
-    Args:
-        fault: Kind and name of the fault.
-        text: Description of the fault, with the fields value, time, first (time), limit and unit, and those of
-            `details`, which has further samples (K,).
-        share: Tolerance relative to the limit; an infinite limit is none.
+    Attributes:
+        name, unit, note: Name and unit of the quantity, and method of the check.
+        times, values: Times, s, and values. Shape (K,).
+        limit: Largest size, infinite if there is none; the least value if `least` is set.
+        share: Tolerance relative to the limit.
         blur: Error of the samples: a violation by less is undetermined.
     """
-    size = -values if least else np.abs(values)
-    excess = limit - values if least else size - limit
-    k, bounded = int(size.argmax()), bool(np.isfinite(limit))
-    value, time = float(values[k]), float(times[k])
-    beyond, certain = ~(excess <= share * limit), ~(excess <= share * limit + blur)
-    verdict = RowVerdict.of(certain.any(), beyond.any()) if bounded else RowVerdict.UNLIMITED
-    row = Row(name, value, limit if bounded else None, unit, time, verdict, note)
-    if verdict is not RowVerdict.FAILED:
-        return row, []
-    first = float(times[np.flatnonzero(certain)[0]])
-    samples = {key: float(column[k]) for key, column in details.items()}
-    words = text.format(value=value, time=time, first=first, limit=limit, unit=unit, **samples)
-    return row, [Fault(*fault, words, time, first, value, limit, unit)]
+
+    name: str
+    times: Array
+    values: Array
+    limit: float
+    unit: str
+    least: bool = False
+    share: float = 0.0
+    blur: float = 0.0
+    note: str = ""
 
 
-def collect(results: list[tuple[Row, list[Fault]]]) -> tuple[list[Row], list[Fault]]:
-    """Return the rows and the faults of several judged quantities."""
-    return [row for row, _ in results], [fault for _, faults in results for fault in faults]
+@dataclass(eq=False)
+class Findings:
+    """Rows of the table of a check, and faults, to which each check adds its own."""
+
+    rows: list[Row] = field(default_factory=list)
+    faults: list[Fault] = field(default_factory=list)
+
+    def judge(self, each: Quantity, fault: tuple[str, str], text: str, details: Mapping[str, Array] = {}) -> None:
+        """Compare samples of a quantity with its limit.
+
+        `fault` is the kind and name of the fault. `text` describes it with the fields value, time, first (time), limit
+        and unit, and those of `details`, which has further samples (K,).
+        """
+        size = -each.values if each.least else np.abs(each.values)
+        excess = each.limit - each.values if each.least else size - each.limit
+        k, bounded = int(size.argmax()), bool(np.isfinite(each.limit))
+        value, time, limit = float(each.values[k]), float(each.times[k]), each.limit if bounded else None
+        allowed = each.share * each.limit
+        beyond, certain = ~(excess <= allowed), ~(excess <= allowed + each.blur)
+        verdict = RowVerdict.of(certain.any(), beyond.any()) if bounded else RowVerdict.UNLIMITED
+        self.rows.append(Row(each.name, value, limit, each.unit, time, verdict, each.note))
+        if verdict is RowVerdict.FAILED:
+            first = float(each.times[np.flatnonzero(certain)[0]])
+            samples = {key: float(column[k]) for key, column in details.items()}
+            words = text.format(value=value, time=time, first=first, limit=limit, unit=each.unit, **samples)
+            self.faults.append(Fault(*fault, words, time, first, value, limit, each.unit))
 
 
 # ---- torques -----------------------------------------------------------------------------------------------------
 
 
-def effort_rows(
-    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check torques that the file gives at the samples against the torque limits; return table rows and faults."""
-    results = []
+def check_efforts(
+    findings: Findings, cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, *, share: float
+) -> None:
+    """Check torques that the file gives at the samples against the torque limits."""
     text = "the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
     efforts = () if cleaned.efforts is None else cleaned.efforts.T
     for joint, values in zip(cleaned.joints, efforts, strict=False):
         name, limit = robot.joint_names[joint], float(bounds.torque[joint])
-        options: dict[str, Any] = {"fault": ("torque", name), "text": text, "share": share}
-        t, unit = cleaned.motion.t, robot.joint(name).effort_unit
-        results.append(judge(f"given torque of {name}", t, values, limit, unit, **options, note="as given in the file"))
-    return collect(results)
+        t, unit, note = cleaned.motion.t, robot.joint(name).effort_unit, "as given in the file"
+        torque = Quantity(f"given torque of {name}", t, values, limit, unit, share=share, note=note)
+        findings.judge(torque, ("torque", name), text)
 
 
-def torque_rows(
-    motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check joint torques from inverse dynamics at five times of every interval; return table rows and faults.
+def check_torques(
+    findings: Findings,
+    machine: FixedBase | FreeFloating | Standing,
+    motion: Motion,
+    bounds: JointBounds,
+    *,
+    share: float,
+) -> None:
+    """Check joint torques from inverse dynamics at five times of every interval.
 
     With linear interpolation they are evaluated at the samples, with velocities and accelerations by differences. A
     floating base moves as the joints drive it, from rest, without gravity.
@@ -123,21 +133,18 @@ def torque_rows(
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
-        return [], []
+        return
     check_time()
     torques = sampler(*values)[0]
     # torques are linear in accelerations
     inertia = np.abs(np.array(ca.Function("inertia", [q], [ca.jacobian(torque, a)])(motion.q.mean(axis=0))))
     acceleration = motion.quantity("acceleration")
     blurs = inertia @ (np.zeros(robot.dof) if acceleration is None else np.median(acceleration.blur, axis=0))
-    results, text = [], "{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
+    text = "{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
     for name, column, limit, blur in zip(robot.joint_names, torques.T, bounds.torque.tolist(), blurs, strict=True):
         options: dict[str, Any] = {"share": share, "blur": blur, "note": _sampling_note(motion)}
-        unit = robot.joint(name).effort_unit
-        results.append(
-            judge(f"torque of {name}", times, column, limit, unit, fault=("torque", name), text=text, **options)
-        )
-    return collect(results)
+        each = Quantity(f"torque of {name}", times, column, limit, robot.joint(name).effort_unit, **options)
+        findings.judge(each, ("torque", name), text)
 
 
 def _sampling_note(motion: Motion) -> str:
@@ -184,8 +191,8 @@ def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
 # ---- the base ----------------------------------------------------------------------------------------------------
 
 
-def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
-    """Check ground force, zero moment point and friction of a standing machine; return table rows and faults."""
+def check_ground(findings: Findings, machine: Standing, motion: Motion, friction: float) -> None:
+    """Check ground force, zero moment point and friction of a standing machine."""
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
     reaction = machine.ground_reaction(q, v, a)
     point = center_of_pressure(reaction)
@@ -193,7 +200,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     sampler = Sampler([q, v, a], [ca.vertcat(margin, reaction[5], ca.norm_2(reaction[3:5]), point)])
     times, *samples = torque_samples(motion)
     if not len(times):
-        return [], []
+        return
     margin, push, slide, x, y = sampler(*samples)[0].T
     details = {"pull": -push, "outside": -margin, "slide": slide, "push": push, "x": x, "y": y}
     checks = [
@@ -203,12 +210,10 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     if np.isfinite(friction):
         words = "the foot slips: {slide:.4g} N along the ground, {push:.4g} N on it,"
         checks.append(("friction", friction * push - slide, "N", words))
-    options: dict[str, Any] = {"details": details, "least": True, "note": _sampling_note(motion)}
-    results = []
-    for quantity, values, unit, words in checks:
-        fault, text = (quantity, machine.robot.root), f"{words} at {{time:.6g}} s, first at {{first:.6g}} s"
-        results.append(judge(quantity, times, values, 0.0, unit, fault=fault, text=text, **options))
-    return collect(results)
+    for name, values, unit, words in checks:
+        text = f"{words} at {{time:.6g}} s, first at {{first:.6g}} s"
+        quantity = Quantity(name, times, values, 0.0, unit, least=True, note=_sampling_note(motion))
+        findings.judge(quantity, (name, machine.robot.root), text, details)
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
@@ -244,12 +249,10 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
     return bases, rows
 
 
-def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check that the total momentum is constant under the given base motion, by central differences; return table rows
-    and faults.
-    """
+def check_momentum(findings: Findings, machine: FreeFloating, motion: Motion, bases: Array) -> None:
+    """Check that the total momentum is constant under the given base motion, by central differences."""
     if len(motion.t) < 3:
-        return [], []
+        return
     robot, size = machine.robot, machine.base_size
     q, v = ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     base, rate = ca.SX.sym("base", size), ca.SX.sym("rate", size)
@@ -268,19 +271,14 @@ def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[
     rates = (bases[2:] - bases[:-2]) / width
     speeds = motion.v[1:-1] if motion.v is not None else (motion.q[2:] - motion.q[:-2]) / width
     whole, carried = Sampler([q, v, base, rate], [total, joints])(motion.q[1:-1], speeds, bases[1:-1], rates)
-    results = []
     for quantity, part, unit in (("moment of momentum", slice(0, 3), "N m s"), ("momentum", slice(3, 6), "N s")):
         change = np.linalg.norm(whole[:, part] - np.median(whole[:, part], axis=0), axis=1)
         own = float(np.linalg.norm(carried[:, part], axis=1).max())
-        text = (
-            f"{quantity} changes by {{value:.4g}} {unit} at {{time:.6g}} s; that of the joints is {own:.4g}: the given "
-        )
-        text += "motion of the base is inconsistent"
-        limit, fault = MOMENTUM_SHARE * own + ROUNDING_SHARE, ("momentum", robot.root)
-        results.append(
-            judge(f"change of {quantity}", times, change, limit, unit, fault=fault, text=text, note="base as given")
-        )
-    return collect(results)
+        text = f"{quantity} changes by {{value:.4g}} {unit} at {{time:.6g}} s; that of the joints is {own:.4g}: "
+        text += "the given motion of the base is inconsistent"
+        limit, name = MOMENTUM_SHARE * own + ROUNDING_SHARE, f"change of {quantity}"
+        each = Quantity(name, times, change, limit, unit, note="base as given")
+        findings.judge(each, ("momentum", robot.root), text)
 
 
 # ---- clearance ---------------------------------------------------------------------------------------------------
@@ -332,8 +330,8 @@ def _sampled_pairs(scene: CollisionScene, motion: Motion, bases: Array) -> list[
     ]
 
 
-def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
-    """Check the clearance between bodies along a motion, and return the table rows and the faults.
+def check_clearance(findings: Findings, scene: CollisionScene, motion: Motion, bases: Array | None) -> None:
+    """Check the clearance between bodies along a motion.
 
     If the base moves, with configurations `bases` (M, base_size) at the samples, distances are computed at the samples
     and midway between them, without a proof.
@@ -345,9 +343,10 @@ def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -
         ignored = [Row("pairs not checked", len(assumptions), None, "", None, RowVerdict.INFO, note)]
     if not len(scene.pairs):
         none = Row("clearance", np.inf, scene.clearance, "m", None, RowVerdict.INFO, "no pairs that can collide")
-        return [none, *ignored], []
+        findings.rows += [none, *ignored]
+        return
     pairs = prove_clearance(scene, motion).pairs if bases is None else _sampled_pairs(scene, motion, bases)
-    rows, faults = [], []
+    rows, faults = list[Row](), list[Fault]()
     proven = min(pair.least for pair in pairs)
     for pair in sorted(pairs, key=lambda pair: pair.distance - pair.required)[:MAX_REPORTED_PAIRS]:
         bodies, time = " and ".join(pair.bodies), float(motion.t[0]) + pair.time
@@ -373,7 +372,8 @@ def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -
         if _verdict(pair) is RowVerdict.UNDECIDED and name not in reported:
             note = f"at least {pair.least:.4g} m is proven"
             rows.append(Row(name, pair.distance, pair.required, "m", time, RowVerdict.UNDECIDED, note))
-    return [*rows, *ignored], faults if bases is not None else _with_beginnings(scene, motion, faults)
+    findings.rows += [*rows, *ignored]
+    findings.faults += faults if bases is not None else _with_beginnings(scene, motion, faults)
 
 
 def _verdict(pair: ClosestPair) -> RowVerdict:
@@ -402,10 +402,17 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
 # ---- the path ----------------------------------------------------------------------------------------------------
 
 
-def path_rows(
-    machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, *, tolerance: float, angle: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check the distance of the tip from a path and the direction of the tool axis; return table rows and faults.
+def check_path(
+    findings: Findings,
+    machine: Machine,
+    motion: Motion,
+    bases: Array | None,
+    *,
+    path: Waypoints,
+    tolerance: float,
+    angle: float,
+) -> None:
+    """Check the distance of the tip from a path and the direction of the tool axis.
 
     The tip is sampled four times in every interval, and more finely at the largest distance. The path consists of
     straight lines between the waypoints. The angle is that of the z axes, if the waypoints have orientations. `bases`
@@ -425,32 +432,32 @@ def path_rows(
         return sampler(base_path, motion.position.at(at))
 
     corners, link = path.positions, machine.robot.tip_link
-    worst = int(_distances(tips(times)[0], corners)[0].argmax())
-    times = np.union1d(times, np.linspace(times[max(worst - 1, 0)], times[min(worst + 1, len(times) - 1)], 65))
     tip_path, axes = tips(times)
     distance, parameter = _distances(tip_path, corners)
-    between = "" if times[distance.argmax()] in motion.t else ", between two samples"
+    worst = int(distance.argmax())
+    finer = np.linspace(times[max(worst - 1, 0)], times[min(worst + 1, len(times) - 1)], 65)
+    order = np.argsort(every := np.append(times, finer))
+    distance = np.append(distance, _distances(tips(finer)[0], corners)[0])
+    between = "" if every[distance.argmax()] in motion.t else ", between two samples"
     text = f"the tip is {{value:.4g}} m from its path at {{time:.6g}} s{between}, {{limit:g}} m allowed"
-    name = "distance of the tip from the path"
-    results = [judge(name, times, distance, tolerance, "m", fault=("path", link), text=text)]
+    name, fault = "distance of the tip from the path", ("path", link)
+    findings.judge(Quantity(name, every[order], distance[order], tolerance, "m"), fault, text)
     miss = _distances(corners, tip_path)[0]
-    k = int(miss.argmax())
-    more = int((miss > tolerance).sum()) - 1
-    text = "the tip comes no closer than {value:.4g} m, {limit:g} m allowed"
-    text += f"; {more} others are also missed" if more > 0 else ""
-    fault, name = (
-        ("path", f"waypoint {k + 1} (line {int(path.lines[k])})"),
-        "distance of a waypoint from the tip's path",
-    )
-    row, faults = judge(name, np.zeros(len(miss)), miss, tolerance, "m", fault=fault, text=text)
-    results.append((replace(row, time=None), [replace(fault, time=None, first=None) for fault in faults]))
+    k, more = int(miss.argmax()), int((miss > tolerance).sum()) - 1
+    name, value = "distance of a waypoint from the tip's path", float(miss[k])
+    findings.rows.append(Row(name, value, tolerance, "m", None, RowVerdict.of(value > tolerance)))
+    if value > tolerance:
+        text = f"the tip comes no closer than {value:.4g} m, {tolerance:g} m allowed"
+        text += f"; {more} others are also missed" if more else ""
+        name = f"waypoint {k + 1} (line {int(path.lines[k])})"
+        findings.faults.append(Fault("path", name, text, None, None, value, tolerance, "m"))
     if path.orientations is not None:
         angles = np.arccos(np.clip((_axes(path, parameter) * axes).sum(axis=1), -1.0, 1.0))
         text = "its z axis deviates by {value:.4g} rad at {time:.6g} s, {limit:g} rad allowed"
         name = "angle of the tool axis from the path's"
-        row, faults = judge(name, times, angles, angle, "rad", fault=("path", link), text=text)
-        results.append((row if np.isfinite(angle) else replace(row, verdict=RowVerdict.INFO), faults))
-    return collect(results)
+        findings.judge(Quantity(name, times, angles, angle, "rad"), fault, text)
+        if not np.isfinite(angle):
+            findings.rows[-1] = replace(findings.rows[-1], verdict=RowVerdict.INFO)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:

@@ -15,13 +15,14 @@ from models.shapes.mesh_files import find_mesh
 from ocp.app.check.data_checks import CleanedTrajectory, clean_trajectory, doubtful_times, exchanged_joints
 from ocp.app.check.joint_limits import Fault, Row, RowVerdict, Rule, limit_rows, rest_row
 from ocp.app.check.motion_checks import (
-    clearance_rows,
-    effort_rows,
+    Findings,
+    check_clearance,
+    check_efforts,
+    check_ground,
+    check_momentum,
+    check_path,
+    check_torques,
     integrate_base,
-    momentum_rows,
-    path_rows,
-    standing_rows,
-    torque_rows,
     with_wide_limits,
 )
 from ocp.app.files import RawTrajectory, Waypoints
@@ -258,19 +259,13 @@ def check_trajectory(
     if interpretation.rule is not None:
         cleaned = replace(cleaned, motion=cleaned.motion.by(interpretation.rule))
     motion, complete = cleaned.motion, len(cleaned.joints) == robot.dof
-    rows: list[Row] = []
-    faults, unchecked = list(cleaned.faults), []
-
-    def add(result: tuple[list[Row], list[Fault]]) -> None:
-        rows.extend(result[0])
-        faults.extend(result[1])
-        check_time()
-
+    findings, share = Findings(faults=list(cleaned.faults)), tolerances.share
     progress("limits")
-    table, limit_faults, too_short = limit_rows(motion, robot, cleaned.joints, bounds, share=tolerances.share)
-    add(([*table, rest_row(motion, robot, cleaned.joints)], limit_faults))
-    unchecked += too_short
-    add(effort_rows(cleaned, robot, bounds, tolerances.share))
+    rows, faults, unchecked = limit_rows(motion, robot, cleaned.joints, bounds, share=share)
+    findings.rows += [*rows, rest_row(motion, robot, cleaned.joints)]
+    findings.faults += faults
+    check_efforts(findings, cleaned, robot, bounds, share=share)
+    check_time()
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
@@ -279,26 +274,28 @@ def check_trajectory(
             progress("momentum")
             if cleaned.base is None:
                 bases, base_rows = integrate_base(machine, motion)
-                rows += base_rows
+                findings.rows += base_rows
             elif (count := cleaned.base.shape[1]) != machine.base_size:
                 words = f"the file gives {count} entries of the base, the machine has {machine.base_size}"
                 raise ProblemError(words, name="base", value=count, limit=machine.base_size)
             else:
                 bases = cleaned.base
-                add(momentum_rows(machine, motion, bases))
+                check_momentum(findings, machine, motion, bases)
         elif isinstance(machine, Standing):
             progress("ground")
-            add(standing_rows(machine, motion, limits.friction))
+            check_ground(findings, machine, motion, limits.friction)
         if robot.total_mass == 0:
             unchecked.append("torques, because the robot has no masses")
         else:
             progress("torques")
-            add(torque_rows(motion, machine, bounds, tolerances.share))
+            check_torques(findings, machine, motion, bounds, share=share)
+        check_time()
         if path is not None:
             progress("path")
             default = default_tolerance(path.positions)
             tolerance = default if tolerances.tip_distance is None else tolerances.tip_distance
-            add(path_rows(machine, motion, bases, path, tolerance=tolerance, angle=tolerances.tip_angle))
+            check_path(findings, machine, motion, bases, path=path, tolerance=tolerance, angle=tolerances.tip_angle)
+            check_time()
         progress("clearance")
         if scene is False:
             unchecked.append("clearance, as requested")
@@ -308,14 +305,14 @@ def check_trajectory(
             place: Scene = require.instance("scene", Scene() if scene is None else scene, Scene)
             unchecked += _missing_meshes(robot, place.folders) if place.missing == "skip" else []
             collisions = CollisionScene(with_wide_limits(machine, motion), **place.collision_options)
-            add(clearance_rows(collisions, motion, bases if collisions.obstacles else None))
+            check_clearance(findings, collisions, motion, bases if collisions.obstacles else None)
     suspicions: list[Fault] = []
-    if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
+    if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in findings.faults):
         suspicions += doubtful_times(motion, bounds.velocity[cleaned.joints])
     if not interpretation.names_confirmed:
         is_fixed = complete and not isinstance(machine, FreeFloating)
         suspicions += exchanged_joints(motion, robot, cleaned.joints, is_fixed)
-    faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
+    findings.faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
     return Check(
         trajectory.file,
         robot.name,
@@ -323,10 +320,10 @@ def check_trajectory(
         cleaned.samples,
         float(motion.t[-1] - motion.t[0]),
         motion.rule,
-        tuple(rows),
-        tuple(faults),
+        tuple(findings.rows),
+        tuple(findings.faults),
         tuple(suspicions),
-        _unlimited_quantities(rows),
+        _unlimited_quantities(findings.rows),
         tuple(unchecked),
         (*cleaned.notes, *notes),
         cleaned,

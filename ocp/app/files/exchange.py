@@ -154,18 +154,13 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
         raise ProblemError(f"{file}: cannot be read: {error.strerror}", name="file", value=str(file)) from error
     except Exception as error:  # mcap, zstandard and lz4 raise many kinds for broken bytes
         raise ProblemError(f"{file} is not a valid log: {error}", name="file", value=str(file)) from error
-    selected = topic
-    if topic is None and len(messages) == 1:
-        selected = next(iter(messages))
-    elif topic is None and "/joint_states" in messages:
-        selected = "/joint_states"
+    selected = topic or (next(iter(messages)) if len(messages) == 1 else "/joint_states")
     if selected not in messages:
         known = ", ".join(sorted(messages)) or "none"
         words = f"{file}: no topic {topic!r} of joint states or joint trajectories; available: {known}; name the topic"
         raise ProblemError(words, name="topic", value=topic, limit=tuple(messages))
-    return selected, [
-        (stamp, fields) for _, stamp, fields in sorted(messages[selected], key=lambda message: message[0])
-    ]
+    ordered = sorted(messages[selected], key=lambda message: message[0])
+    return selected, [(stamp, fields) for _, stamp, fields in ordered]
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:

@@ -275,19 +275,18 @@ class _Reader:
                 self._refuse("G53 is supported with G0 only")
             if any(words[AXES[i]] for i in axes):
                 self._refuse("G53 moves in the machine's own coordinates; write the position in the program's")
+        via = self._target(words)
+        for axis in AXES:
+            words.pop(axis, None)
         if self.home is None:
-            for axis in AXES:
-                words.pop(axis, None)
             if has_moved:
                 self.machine = self.block
             self._note(f"{code_name(code)}: the machine's own position; ignored")
             return
-        if code != 530:  # via the programmed point
-            self._rapid(self._target(words))
+        if code != 530:
+            self._rapid(via)
         target = self.position.copy()
         target[axes or slice(None)] = self.home[axes or slice(None)]
-        for axis in AXES:
-            words.pop(axis, None)
         self._rapid(target)
 
     def _shift(self, codes: set[int], words: dict[str, float]) -> None:

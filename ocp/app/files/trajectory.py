@@ -11,6 +11,7 @@ in brackets: `elbow [deg]`, `time [ms]`. Commas, semicolons, tabs or blanks sepa
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -264,9 +265,8 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
         if missing and kind == "positions":
             raise ProblemError(f"{file}: point {missing[0]} has no positions", name=f"point {missing[0]}")
         if missing:
-            notes.append(
-                f"{len(missing)} of {len(rows)} points have no {kind}, first point {missing[0]}: all are ignored"
-            )
+            count = f"{len(missing)} of {len(rows)} points"
+            notes.append(f"{count} have no {kind}, first point {missing[0]}: all are ignored")
         else:
             values[kind] = _rows(file, word, rows, len(names))
     places: dict[str, Any] = {"lines": np.arange(1, len(points) + 1), "notes": tuple(notes), "file": str(file)}
@@ -317,15 +317,11 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
             notes.append(f"{topic} has {len(messages)} trajectories; only the first is read")
         trajectory = _from_points(file, first)
         return replace(trajectory, notes=(*trajectory.notes, *notes))
-    counts: dict[frozenset[str], int] = {}
-    for _, state in messages:
-        counts[frozenset(state["name"])] = counts.get(frozenset(state["name"]), 0) + 1
-    joint_set = max(counts, key=lambda joints: counts[joints])
-    states = [(stamp, state) for stamp, state in messages if frozenset(state["name"]) == joint_set]
-    if len(states) < len(messages):
-        notes.append(
-            f"{len(messages) - len(states)} of {len(messages)} messages on {topic} are of other joints and are ignored"
-        )
+    joint_sets = [frozenset(state["name"]) for _, state in messages]
+    ((most, _),) = Counter(joint_sets).most_common(1)
+    states = [message for message, joints in zip(messages, joint_sets, strict=True) if joints == most]
+    if (ignored := len(messages) - len(states)) > 0:
+        notes.append(f"{ignored} of {len(messages)} messages on {topic} are of other joints and are ignored")
     names = tuple(states[0][1]["name"])
     if len(set(names)) != len(names) or not names:
         raise ProblemError(f"{file}: the joints {names} on {topic} must be distinct names", name="name", value=names)

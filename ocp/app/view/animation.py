@@ -68,9 +68,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Corners (k, 2), m, of the contact area of a standing machine, zero moment points (M, 2), m, and whether they take
-    external forces into account.
-    """
+    """Corners (k, 2), m, of the contact area, and zero moment points (M, 2), m, with or without external forces."""
 
     corners: Array
     points: Array

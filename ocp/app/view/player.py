@@ -200,12 +200,10 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
         "time": buffers.put(motion.t, "f4"),
         "curves": [
             {
-                "group": curve.group,
-                "name": curve.name,
-                "unit": curve.unit,
+                **vars(curve),
                 "values": buffers.put(curve.values, "f4"),
-                "lower": float(curve.lower) if np.isfinite(curve.lower) else None,
-                "upper": float(curve.upper) if np.isfinite(curve.upper) else None,
+                "lower": _plain(curve.lower),
+                "upper": _plain(curve.upper),
             }
             for curve in motion.curves
         ],
