@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import RK45
+import scipy
 
 
 @dataclass(frozen=True)
@@ -123,15 +123,16 @@ def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> t
     error is estimated as the difference from the embedded step of order 4.
     """
     slopes: list[Any] = []
+    table: Any = scipy.integrate.RK45
 
     def sum_of(weights: Any) -> Any:
         return sum(h * weight * value for weight, value in zip(weights, slopes, strict=False) if weight)
 
-    for place, weights in zip(RK45.C.tolist(), RK45.A.tolist(), strict=True):
+    for place, weights in zip(table.C.tolist(), table.A.tolist(), strict=True):
         slopes.append(slope(place, x + sum_of(weights)))
-    after = x + sum_of(RK45.B.tolist())
+    after = x + sum_of(table.B.tolist())
     slopes.append(slope(1.0, after))
-    return after, sum_of((-RK45.E).tolist())
+    return after, sum_of((-table.E).tolist())
 
 
 def integrator(

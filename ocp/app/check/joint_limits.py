@@ -18,8 +18,8 @@ from math import comb
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly, PPoly
 
 from models import FixedBase, Robot
 from models.checks import Array, real
@@ -152,8 +152,9 @@ def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
     """Return maxima on [0, 1] of polynomials in Bernstein form (K, d + 1), and where they occur. Shape (K,) each."""
     first, last, count = coefficients[:, 0], coefficients[:, -1], len(coefficients)
     best, argument = np.maximum(first, last), (last > first).astype(float)
-    pieces = BPoly(coefficients.T, np.arange(count + 1.0))
-    stationary = PPoly.from_bernstein_basis(pieces.derivative()).roots(discontinuity=False, extrapolate=False)
+    pieces = scipy.interpolate.BPoly(coefficients.T, np.arange(count + 1.0))
+    slopes = scipy.interpolate.PPoly.from_bernstein_basis(pieces.derivative())
+    stationary = slopes.roots(discontinuity=False, extrapolate=False)
     stationary = stationary[np.isfinite(stationary)]
     owner, values = np.minimum(stationary.astype(int), count - 1), pieces(stationary)
     improved = np.flatnonzero(values > best[owner])

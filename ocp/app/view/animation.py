@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
+import scipy
 
 from models import FreeFloating, Machine, Standing
 from models.checks import Array
@@ -346,7 +346,7 @@ def _animation(
 ) -> Animation:
     """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
-    effort = cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
+    effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
     costs = [one for one in own_curves if one.group == "Cost"]
     curves += [one for one in costs if abs(one.values[-1] - effort[-1]) > relative * max(abs(effort[-1]), 1e-12)]
@@ -403,7 +403,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
     p = form.parameter_vector(ordered.parameters)
     running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
     lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
-    integral = cumulative_trapezoid(running[:, 0], fractions * ordered.horizon, initial=0.0)
+    integral = scipy.integrate.cumulative_trapezoid(running[:, 0], fractions * ordered.horizon, initial=0.0)
     return [Curve("Cost", "the problem's own cost, integrated", "", integral)] + [
         Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
         for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
