@@ -239,13 +239,8 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     check = _command(commands, "check", "check a joint trajectory", CHECK, CHECK_EXAMPLES, run_check)
     _file(check, "robot", "URDF file of the robot")
     _file(check, "trajectory", "CSV, JointTrajectory as JSON or YAML, MCAP, or robot program")
-    check.set_defaults(
-        called={
-            "folders=[FOLDER]": "--folder FOLDER",
-            "missing='skip'": "--no-meshes",
-            "models.rectangle(...)": "--foot",
-        }
-    )
+    folder = {"folders=[FOLDER]": "--folder FOLDER"}
+    check.set_defaults(called={**folder, "missing='skip'": "--no-meshes", "models.rectangle(...)": "--foot"})
     robot_options(check)
     check_options(check)
     _file(check, "--report", "also write one HTML file: pictures, curves with limits, every row")
@@ -278,8 +273,8 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     report.add_argument("--title", help="title of the report (default: the robot and the plan's file)")
     margin = _command(commands, "margin", "how far the model may be wrong", MARGIN, MARGIN_EXAMPLES, run_margin)
     _file(margin, "plan", "file of a plan (.npz)")
-    size: dict[str, Any] = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=VALUE"}
-    margin.add_argument("--size", **size, help="size that the plan shall cover; repeatable")
+    named: dict[str, Any] = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=VALUE"}
+    margin.add_argument("--size", **named, help="size that the plan shall cover; repeatable")
     margin.add_argument("--tolerance", type=float, metavar="M", help="allowed deviation of the tip, m (default: any)")
     margin.set_defaults(called={"tolerance=...": "--tolerance M"})
     view = _command(commands, "view", "play motions in a browser", VIEW, VIEW_EXAMPLES, run_view)
@@ -292,20 +287,13 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     view.add_argument("--name", action="append", default=[], help="name of a motion; repeatable, in order of the files")
     view.add_argument("--port", type=int, default=8080, help="port, or the next free one (default: 8080)")
     view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
-    view.add_argument(
-        "--tolerance",
-        type=_named_number,
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="tolerance of the audit; repeatable",
-    )
+    view.add_argument("--tolerance", **named, help="tolerance of the audit; repeatable")
     _file(view, "--robot", "URDF file of the robot that a solution moves")
     robot_options(view)
     view.add_argument("--floating", action="store_true", help="the base floats: the state 'base' of the solution")
     view.add_argument("--joints", default="joints", metavar="STATE", help="state of the joints (default: joints)")
     view.add_argument("--base", default="base", metavar="STATE", help="state of the base (default: base)")
-    view.set_defaults(called={"folders=[FOLDER]": "--folder FOLDER"})
+    view.set_defaults(called=folder)
     stored = _command(commands, "cache", "show or clear the cache between runs", CACHE, CACHE_EXAMPLES, run_cache)
     stored.add_argument("action", nargs="?", choices=("show", "clear"), default="show", help="(default: show)")
     shell = _command(commands, "completion", "print a script of shell completion", COMPLETION, "", run_completion)

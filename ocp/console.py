@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextvars
 import ctypes
-import io
 import logging
 import sys
 import threading
@@ -41,10 +40,8 @@ GRACE_PERIOD_S = 0.8
 class _Call(threading.Thread):
     """Thread that executes a call of a public function, and that the main thread can stop.
 
-    Attributes:
-        stop: Whether the call has been asked to end.
-        listeners: Number of loops in the call that poll ``stop`` and end by themselves. heard: Whether a loop has seen
-            that ``stop`` is set.
+    `stop` says that the call has been asked to end, `heard` that a loop in it has seen that, and `listeners` how many
+    loops poll it and end by themselves.
     """
 
     def __init__(self, work: Callable[[], Any]) -> None:
@@ -192,24 +189,18 @@ def check_time() -> None:
 # ---- CasADi's output --------------------------------------------------------------------------------------------
 
 
-class _FilteredStream(io.TextIOBase):
+class _FilteredStream:
     """Replacement for ``sys.stderr`` that discards the output of the threads listed in ``silent``."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
         self.silent: Counter[int] = Counter()
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.real, name)
+
     def write(self, text: str) -> int:
         return len(text) if threading.get_ident() in self.silent else int(self.real.write(text))
-
-    def flush(self) -> None:
-        self.real.flush()
-
-    def isatty(self) -> bool:
-        return bool(self.real.isatty())
-
-    def fileno(self) -> int:
-        return int(self.real.fileno())
 
 
 _FILTER_LOCK = threading.Lock()
@@ -225,7 +216,7 @@ def casadi_silenced() -> Iterator[None]:
     with _FILTER_LOCK:
         if not isinstance(sys.stderr, _FilteredStream):
             sys.stderr = _FilteredStream(sys.stderr)
-        stream = sys.stderr
+        stream: Any = sys.stderr
         stream.silent[thread] += 1
     try:
         yield
@@ -267,13 +258,8 @@ def report(stage: str, *, step: bool = False) -> None:
 def shown_progress(title: str, progress: Any) -> Iterator[None]:
     """Show the progress of a ``with`` block: the names of the stages that its code reports by :func:`report`.
 
-    Args:
-        title: Name of the call.
-        progress: Function that is called with the name of each stage; True: a line on the terminal; False: nothing.
-            None: a line after two seconds, if there is a terminal or a notebook and nobody else shows the call.
-
-    Raises:
-        ProblemError: `progress` is something else.
+    ``progress`` is a function that is called with the name of each stage; True: a line on the terminal; False: nothing;
+    None: a line after two seconds, if there is a terminal or a notebook and nobody else shows the call.
     """
     if progress is None and (_LISTENER.get() is not None or not _is_interactive()):
         yield
@@ -302,10 +288,9 @@ def _is_interactive() -> bool:
 
 
 class Progress:
-    """Progress display of a command or call: one line that is updated on a terminal, or lines in a log.
+    """Progress of a command or call: a line on a terminal or in a notebook after `delay` seconds, or lines of a log.
 
-    On a terminal or in a notebook the line appears after `delay` seconds; a log has a line at the start, every 30 s and
-    at the end.
+    A log has a line at the start, every 30 s and at the end.
     """
 
     def __init__(self, title: str, quiet: bool = False, delay: float = TERMINAL_DELAY_S) -> None:
@@ -370,45 +355,24 @@ class Progress:
 # ---- solver iterations -------------------------------------------------------------------------------------------
 
 
-class _Monitor(ca.Callback):  # type: ignore[misc]
-    """Solver callback that stores the current iterate, and stops the solver on Ctrl-C or at the time limit."""
+class IterationMonitor(ca.Callback):  # type: ignore[misc]
+    """Solver callback that stores the current iterate, and stops the solver on Ctrl-C or at the time limit.
 
-    def __init__(self, n: int, title: str, name: str) -> None:
-        ca.Callback.__init__(self)
-        self.title, self.iterate, self.iterations = title, np.zeros(n), 0
-        self.stopped: SolverStatus | None = None
-        self.construct(name, {})
-
-    def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Prepare the monitor for a solve; the arguments are the bounds of the constraints of the program."""
-        self.lower, self.upper = lower, upper
-        self.stopped, self.iterations = None, 0
-
-    def close(self) -> None:
-        """Finish the monitoring of a solve."""
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def _store(self, iterate: Any) -> None:
-        """Store an iterate of the solver, and decide whether the solver shall stop."""
-        try:
-            self.stopped = self.stopped or reason_to_stop()
-        except KeyboardInterrupt:  # CasADi would turn it into another error
-            self.stopped = SolverStatus.INTERRUPTED
-        self.iterations, self.iterate = self.iterations + 1, np.asarray(iterate.full()).reshape(-1)
-
-
-class IterationMonitor(_Monitor):
-    """Iteration callback of a solver that shows a progress line on a terminal, unless the call has its own display."""
+    It shows a progress line on a terminal, unless the call has its own display. :meth:`open` and :meth:`close` enclose
+    a solve; ``lower`` and ``upper`` are the bounds of the constraints of the program.
+    """
 
     def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
+        ca.Callback.__init__(self)
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
+        self.title, self.iterate, self.iterations = title, np.zeros(n), 0
+        self.stopped: SolverStatus | None = None
         self.show, self.line = show, Progress(title, quiet=True)
-        super().__init__(n, title, "progress")
+        self.construct("progress", {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        super().open(lower, upper)
+        self.lower, self.upper = lower, upper
+        self.stopped, self.iterations = None, 0
         quiet = not self.show or not _is_interactive() or _LISTENER.get() is not None
         self.line = Progress(self.title, quiet=quiet, delay=SOLVE_DELAY_S)
         self.line.__enter__()
@@ -422,32 +386,34 @@ class IterationMonitor(_Monitor):
     def get_name_in(self, i: int) -> str:
         return str(ca.nlpsol_out(i))
 
+    def get_n_out(self) -> int:
+        return 1
+
     def get_sparsity_in(self, i: int) -> Any:
         return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
 
-    def eval(self, arguments: list[Any]) -> list[int]:
+    def eval(self, arguments: list[Any]) -> list[float]:
         if not self.line.quiet:
             g = np.asarray(arguments[2].full()).reshape(-1)
             worst = float(np.max(np.maximum(self.lower - g, g - self.upper), initial=0.0))
             cost = f"cost {float(arguments[1]):.6g}, infeasibility {worst:.1e}"
             self.line.stage = f"{self.iterations + 1} iterations, {cost}"
-        self._store(arguments[0])
-        return [int(bool(self.stopped))]
+        try:
+            self.stopped = self.stopped or reason_to_stop()
+        except KeyboardInterrupt:  # CasADi would turn it into another error
+            self.stopped = SolverStatus.INTERRUPTED
+        self.iterations, self.iterate = self.iterations + 1, np.asarray(arguments[0].full()).reshape(-1)
+        return [float(bool(self.stopped))]
 
 
-class FatropMonitor(_Monitor):
+class FatropMonitor(IterationMonitor):
     """Function that serves as callback of fatrop: called at each iterate, it returns 1 to continue or 0 to stop."""
 
     def __init__(self, n: int, title: str) -> None:
-        self.size = n
-        super().__init__(n, title, "watch")
+        super().__init__(n, 0, 0, title=title, show=False)
 
     def get_n_in(self) -> int:
         return 1
 
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.size, 1)
-
     def eval(self, arguments: list[Any]) -> list[float]:
-        self._store(arguments[0])
-        return [float(not self.stopped)]
+        return [1.0 - super().eval(arguments)[0]]

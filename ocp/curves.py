@@ -8,17 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-
-DORMAND_PRINCE = (
-    (0.0, ()),
-    (1 / 5, (1 / 5,)),
-    (3 / 10, (3 / 40, 9 / 40)),
-    (4 / 5, (44 / 45, -56 / 15, 32 / 9)),
-    (8 / 9, (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729)),
-    (1.0, (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
-    (1.0, (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
-)  # position and weights of each stage of the method; the last weights are those of the step
-DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+import scipy
 
 
 @dataclass(frozen=True)
@@ -133,14 +123,16 @@ def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> t
     error is estimated as the difference from the embedded step of order 4.
     """
     slopes: list[Any] = []
-    after = x
-    for place, weights in DORMAND_PRINCE:
-        after = x
-        for weight, value in zip(weights, slopes, strict=True):
-            after = after + h * weight * value if weight else after
-        slopes.append(slope(place, after))
-    error = sum(h * weight * value for weight, value in zip(DORMAND_PRINCE_ERROR, slopes, strict=True) if weight)
-    return after, error
+    table: Any = scipy.integrate.RK45
+
+    def sum_of(weights: Any) -> Any:
+        return sum(h * weight * value for weight, value in zip(weights, slopes, strict=False) if weight)
+
+    for place, weights in zip(table.C.tolist(), table.A.tolist(), strict=True):
+        slopes.append(slope(place, x + sum_of(weights)))
+    after = x + sum_of(table.B.tolist())
+    slopes.append(slope(1.0, after))
+    return after, sum_of((-table.E).tolist())
 
 
 def integrator(
@@ -155,13 +147,10 @@ def integrator(
 ) -> Any:
     """Return a casadi integrator of differential equations by CVODES, with variable step width and order.
 
-    Args:
-        dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.
-        start, places: Initial time, and the times at which the integrator returns the states.
-        tolerance: Relative and absolute tolerance of the local error. max_steps: Maximum number of steps between two
-            places.
-        smooth: Use Adams formulas, for smooth dynamics that are not stiff, and no warning of a failed trial step; else
-            backward differentiation formulas.
+    ``dae`` is casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too. ``start`` is the
+    initial time, and ``places`` are the times at which the integrator returns the states, with at most ``max_steps``
+    steps between two of them. ``tolerance`` is that of the local error, relative and absolute. Adams formulas are used
+    for ``smooth`` dynamics that are not stiff, without a warning of a failed trial step, else backward differentiation.
     """
     options: dict[str, Any] = {
         "reltol": tolerance,

@@ -162,11 +162,7 @@ def format_distinct(*numbers: float) -> list[str]:
 def values_within(value: Any, upper: float, name: str, problem: str) -> np.ndarray:
     """Return times or distances, one number or a row, as an array of floats clipped to the range from 0 to `upper`.
 
-    Args:
-        value: One number, or numbers.
-        upper: Largest value, such as the horizon, s.
-        name: Name of the argument, which begins the error message.
-        problem: End of the error message, which says what a number outside the range is outside of.
+    The name of the argument begins the error message, and `problem` ends it for a number outside the range.
 
     Raises:
         ProblemError: A value is not a number or not in a row, or is outside the range by more than rounding.

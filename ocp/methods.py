@@ -1,9 +1,8 @@
 """Functions ``solve(problem, method)``, ``prepare`` for repeated solves, and ``certificate`` to compare methods.
 
-A second solver of another kind confirms a plan. The interior-point method that solves problems and the active-set
-method SLEQP have no step in common: SLEQP (sequential linear programs that determine the active set, then
-equality-constrained quadratic programs; Byrd, Gould, Nocedal, Waltz 2004) finds its own multipliers and its own active
-set.
+The interior-point method that solves problems and SLEQP, the second solver that confirms a plan, have no step in
+common: SLEQP (sequential linear programs that determine the active set, then equality-constrained quadratic programs;
+Byrd, Gould, Nocedal, Waltz 2004) finds its own multipliers and its own active set.
 """
 
 from __future__ import annotations
@@ -31,12 +30,8 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """Settings of the descent from a stationary plan that is not a minimum of the cost to a plan of lower cost.
-
-    Attributes:
-        descents: Maximum number of consecutive descents.
-        move: Displacement of the new guess, relative to the range of the plan or of its bounds, or absolute without
-            either.
+    """Settings of the descent from a stationary plan that is not a minimum: the maximum number of descents, and the
+    displacement of the guess relative to the range of the plan or of its bounds (absolute without either).
     """
 
     descents: int = 3
@@ -246,14 +241,12 @@ class Comparison:
     cost, since both values may vanish.
 
     Attributes:
-        name: Name of the solution.
-        passed: Whether its audit passed.
+        name, passed: Name of the solution, and whether its audit passed.
         cost, horizon: Cost and final time (s) of the solution.
         cost_difference, horizon_difference: Relative differences.
         state, costate: Largest difference over time.
-        control: Mean difference over time: at a jump, solutions with slightly different switching times differ by the
-            full jump.
-        hamiltonian: Mean difference over time.
+        control, hamiltonian: Mean difference over time: at a jump, solutions with slightly different switching times
+            differ by the full jump.
     """
 
     name: str
@@ -300,16 +293,12 @@ class Certificate:
     @property
     def verdict(self) -> str:
         """The result of the comparison in one sentence."""
-        different = [c.name for c in self.comparisons if not c.worst <= self.tolerance]
-        failed = [c.name for c in self.comparisons if not c.passed]
         if self.passed:
             return f"{len(self.comparisons)} solutions agree to {self.tolerance:g}, and each passed its audit"
-        parts = []
-        if different:
-            parts.append(f"{', '.join(different)} differ from {self.reference} by more than {self.tolerance:g}")
-        if failed:
-            parts.append(f"the audit of {', '.join(failed)} failed")
-        return "; ".join(parts)
+        different = ", ".join(c.name for c in self.comparisons if not c.worst <= self.tolerance)
+        failed = ", ".join(c.name for c in self.comparisons if not c.passed)
+        parts = [f"{different} differ from {self.reference} by more than {self.tolerance:g}"] if different else []
+        return "; ".join([*parts, *([f"the audit of {failed} failed"] if failed else [])])
 
     def __repr__(self) -> str:
         return f"<Certificate of {self.problem!r}: {self.verdict}>"
@@ -406,18 +395,12 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Return solutions by name, or by method if they come without names; raise ProblemError for anything else."""
-    if not isinstance(solutions, Mapping):
-        return name_by_method(require.each("certificate: solutions", solutions, Solution))
-    named = require.mapping("certificate: solutions", solutions)
-    require.each("certificate: solutions", named.values(), Solution)
-    return named
-
-
-def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
-    """Return solutions by the name of their method, such as ``Collocation legendre-3, 50``; repeats are numbered."""
+    """Return solutions by name, or by the name of their method, such as ``Collocation legendre-3, 50``."""
+    if isinstance(solutions, Mapping):
+        require.each("certificate: solutions", solutions.values(), Solution)
+        return require.mapping("certificate: solutions", solutions)
     named: dict[str, Solution] = {}
-    for solution in solutions:
+    for solution in require.each("certificate: solutions", solutions, Solution):
         method = solution.method
         detail = {
             "Collocation": f" {method.get('scheme')}-{method.get('degree')}, {method.get('intervals')}",
@@ -425,10 +408,8 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
             "Indirect": f" {method.get('shooting')}, {method.get('segments')}",
         }.get(method["type"], "")
         name = base = method["type"] + detail
-        count = 1
         while name in named:
-            count += 1
-            name = f"{base} ({count})"
+            name = f"{base} ({2 + sum(other.startswith(f'{base} (') for other in named)})"
         named[name] = solution
     return named
 
@@ -436,11 +417,11 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Return samples of a solution for a comparison, and the sizes of its Hamiltonian and of its running cost.
+    """Return states and controls at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` ones, and
+    sizes.
 
-    States and controls are sampled at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` ones. The
-    sizes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free horizon, and
-    the mean absolute running cost.
+    The sizes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free horizon,
+    and the mean absolute running cost.
     """
     lam = solution.costate_interpolant(reported)
     symbol = form.sym("lam", form.nx)

@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models.checks import NOT_NUMBERS, floats
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import AuditError, ProblemError, SolverStatus, StorageWarning, values_within
@@ -28,7 +27,6 @@ from ocp.solution_data import (
     HEAD,
     INTERPOLANTS,
     MAX_HEAD_BYTES,
-    NODE_TOLERANCE,
     POOLS,
     Refinement,
     Sample,
@@ -126,13 +124,11 @@ class Solution:
 
     def __str__(self) -> str:
         """Return a text of at most 15 lines with method, solver, cost, and the ranges of states and controls."""
-        lines = [
-            f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
-            f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
-        ]
+        head = f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
+        head += f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
         if self.tightening_cost:
-            lines[0] += f"; limits between the nodes take about {self.tightening_cost:.2g} of the cost"
-        pools = {**self.states, **self.controls}
+            head += f"; limits between the nodes take about {self.tightening_cost:.2g} of the cost"
+        pools, lines = {**self.states, **self.controls}, [head]
         width = max(map(len, pools), default=0)
         for name, values in list(pools.items())[: MAX_LINES - 2]:
             kind = "state" if name in self.states else "control"
@@ -210,31 +206,19 @@ class Solution:
 
     def at_fraction(self, fraction: Any) -> Sample:
         """Return states and controls at fractions 0..1 of the horizon, as :meth:`at` does at times."""
-        try:
-            at = floats(fraction)
-            inside = bool(((at >= -NODE_TOLERANCE) & (at <= 1 + NODE_TOLERANCE)).all())
-        except NOT_NUMBERS:
-            inside = False
-        if not inside:
-            words = f"fractions of the horizon, 0 to 1, are expected, not {fraction!r}"
-            raise ProblemError(words, name="fraction", value=fraction, limit=(0.0, 1.0))
-        flat = np.clip(at.reshape(-1), 0.0, 1.0)
+        at = values_within(fraction, 1.0, "fraction", "of the horizon is outside 0 to 1")
         values: dict[str, np.ndarray] = {}
         for pool, interpolant in ((self.states, self.state_interpolant), (self.controls, self.control_interpolant)):
-            values |= unstack(pool, interpolant(flat))
+            values |= unstack(pool, interpolant(np.atleast_1d(at)))
         return Sample({name: v[0] if at.ndim == 0 else v for name, v in values.items()})
 
     @property
     def phases(self) -> dict[str, tuple[float, float]]:
         """Start and end times (s) of all phases, by name; empty without phases (:mod:`ocp.problem.phases`)."""
         declared = {} if self.problem is None else self.problem.declared.phases
-        if not declared:
-            return {}
-        times = self._sample(
-            [part for phase in declared.values() for part in (phase.begin, phase.duration)], np.ones(1)
-        )
-        begins, lengths = (np.ravel(times[k::2]) for k in (0, 1))
-        return {name: (float(b), float(b + n)) for name, b, n in zip(declared, begins, lengths, strict=True)}
+        parts = [part for phase in declared.values() for part in (phase.begin, phase.duration)]
+        times = [float(value.item()) for value in self._sample(parts, np.ones(1))] if parts else []
+        return {name: (b, b + n) for name, b, n in zip(declared, times[::2], times[1::2], strict=True)}
 
     def phase(self, name: str) -> Solution:
         """Return one phase as a solution over the time from 0 to its duration, with the variable names of the phase.

@@ -1,8 +1,7 @@
 """Data classes and consistency checks of solutions, and a registry of functions that other packages implement.
 
-`Solution.audit`, `Solution.sensitivity` and the `plot` methods belong to classes, but their work is done by packages
-that import `Solution`. These packages register their functions here by name, and the methods look them up, so that
-imports run in one direction. A function is imported on its first call.
+The work of `Solution.audit`, `Solution.sensitivity` and the `plot` methods is done by packages that import `Solution`.
+They register their functions here by name, so that imports run in one direction.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import importlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -53,12 +52,9 @@ class Sample(dict[str, np.ndarray]):
 class Refinement:
     """Record of a mesh refinement: number of intervals and errors in each round.
 
-    Attributes:
-        intervals: Number of intervals in each round.
-        errors: The largest error of each kind in each round, divided by its limit: "integration", "equalities" and
-            "limits" (bounds and inequalities) between the points, lost "cost", "other" rows of the audit.
-        tolerance: Requested integration tolerance. reached: Whether all errors are within their limits and the audit
-            passes.
+    ``errors`` has the largest error of each kind divided by its limit: "integration", "equalities" and "limits" (bounds
+    and inequalities) between the points, lost "cost", "other" rows of the audit. ``tolerance`` is that of integration,
+    and ``reached`` says that all errors are within their limits and the audit passes.
     """
 
     intervals: tuple[int, ...]
@@ -155,15 +151,7 @@ def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.nd
     return values
 
 
-class VariableSlices(Protocol):
-    """Protocol of a problem whose states and controls are slices, given by name, of stacked vectors."""
-
-    name: str
-    states: dict[str, slice]
-    controls: dict[str, slice]
-
-
-def check_variables_match(form: VariableSlices, solution: Any) -> None:
+def check_variables_match(form: Any, solution: Any) -> None:
     """Raise ProblemError unless a plan has the states and controls of a problem, in any order."""
     for what in ("states", "controls"):
         sizes = {name: values.shape[1] for name, values in getattr(solution, what).items()}
@@ -173,20 +161,17 @@ def check_variables_match(form: VariableSlices, solution: Any) -> None:
             raise ProblemError(words, name=what, value=sizes, limit=expected)
 
 
-def match_order(form: VariableSlices, solution: Any) -> Any:
+def match_order(form: Any, solution: Any) -> Any:
     """Return a plan with its variables in the order of the problem, because interpolants have columns without names."""
-    orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
+    orders = {"states": list(form.states), "controls": list(form.controls), "costates": list(form.states)}
     changes: dict[str, Any] = {}
-    for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
-        values_by_name, names = getattr(solution, pool), orders[pool]
+    for (pool, names), interpolant in zip(orders.items(), INTERPOLANTS, strict=True):
+        values_by_name = getattr(solution, pool)
         if list(values_by_name) == names:
             continue
-        offsets = dict(
-            zip(values_by_name, np.cumsum([values.shape[1] for values in values_by_name.values()]), strict=True)
-        )
-        columns = np.concatenate(
-            [np.arange(offsets[name] - values_by_name[name].shape[1], offsets[name]) for name in names]
-        )
+        widths = [values.shape[1] for values in values_by_name.values()]
+        places = dict(zip(values_by_name, np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1]), strict=True))
+        columns = np.concatenate([places[name] for name in names])
         curve = getattr(solution, interpolant)
         changes[pool] = {name: values_by_name[name] for name in names}
         changes[interpolant] = replace(curve, values=curve.values[:, :, columns])
@@ -289,12 +274,8 @@ def _check_tightening(solution: Any) -> None:
     amounts = _real(solution, "bound_tightening", solution.bound_tightening, 3)
     entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
     shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
-    if (
-        amounts.shape[:2] != shape[:2]
-        or amounts.shape[2] < entries
-        or not (amounts >= 0).all()
-        or np.isinf(amounts).any()
-    ):
+    fits = amounts.shape[:2] == shape[:2] and amounts.shape[2] >= entries
+    if not fits or not (amounts >= 0).all() or np.isinf(amounts).any():
         words = f"must be finite and not negative, of shape {shape} or with additional path rows"
         raise _invalid(solution, "bound_tightening", words)
 
@@ -303,11 +284,7 @@ def check_finite(solution: Any) -> None:
     """Raise ProblemError, with the name of the value, if a plan that counts as solved contains nan or infinity."""
     if not solution.success:
         return
-    parts: dict[str, Any] = {
-        "cost": solution.cost,
-        "variables": solution.variables,
-        "multipliers": solution.multipliers,
-    }
+    parts: dict[str, Any] = {name: getattr(solution, name) for name in ("cost", "variables", "multipliers")}
     for pool in ("states", "controls", "costates", "parameters"):
         parts |= {f"{pool[:-1]} {name!r}": values for name, values in getattr(solution, pool).items()}
     parts |= {kind: getattr(solution, kind).values for kind in INTERPOLANTS}
@@ -325,11 +302,7 @@ def register(operation: str, module: str) -> None:
 
 
 def call_registered(operation: str, *args: Any, **options: Any) -> Any:
-    """Call a function that `register` has made available.
-
-    Raises:
-        LookupError: No package has registered a function of that name.
-    """
+    """Call a function that `register` has made available; raise LookupError if there is none."""
     if operation not in _FUNCTIONS:
         raise LookupError(f"no package has registered {operation!r}; import ocp, which registers all of them")
     function: Callable[..., Any] = getattr(importlib.import_module(_FUNCTIONS[operation]), operation)

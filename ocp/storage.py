@@ -32,12 +32,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"  # precedes it in a larger archive
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays to a compressed ``.npz`` file atomically, see :func:`write_whole`.
-
-    Raises:
-        ProblemError: path is not the path of a file, or the arrays are larger than :func:`read_arrays` accepts.
-        OSError: The file cannot be written.
-    """
+    """Write named arrays to a compressed ``.npz`` file atomically, if :func:`read_arrays` accepts their size."""
     checked_path(path)
     size = sum(array.nbytes for array in arrays.values())
     if size > MAX_FILE_BYTES:
@@ -54,10 +49,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any], synced: bool = True) -> None:
     """Write a file atomically; if ``synced`` is true, return only after the file is on the disk.
 
-    Without ``synced`` the file appears some ms earlier, and may be empty after a loss of power; use it for files whose
-    readers detect incompleteness.
-
-    Links are followed, and the mode of an existing file is kept. Until it is complete the file is called
+    Without ``synced`` the file may be empty after a loss of power; use it for files whose readers detect this. Links
+    are followed, and the mode of an existing file is kept. Until it is complete the file is called
     ``NAME.xxxxxxxx.part`` and is locked. Such files without a lock, left by killed processes, are removed.
 
     Raises:
@@ -68,15 +61,16 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any],
     target = Path(os.path.realpath(path))
     mode = None
     with suppress(FileNotFoundError):
-        status = target.stat()
-        check_regular(path, status)
-        mode = stat.S_IMODE(status.st_mode)
+        mode = target.stat().st_mode
+        if not stat.S_ISREG(mode):
+            words = f"{path} is not a file, but a folder, a pipe or a device"
+            raise ProblemError(words, name="path", value=str(path))
     remove_abandoned(target)
     stream = open_part(target)
     try:
         with stream:
             if mode is not None:
-                os.fchmod(stream.fileno(), mode)
+                os.fchmod(stream.fileno(), stat.S_IMODE(mode))
             write(stream)
             stream.flush()
             if synced:
@@ -125,11 +119,8 @@ def remove_abandoned(target: Path) -> None:
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by name; only real numbers are accepted.
 
-    Sizes are checked before anything is unpacked, so memory is bounded by twice ``MAX_FILE_BYTES``.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ProblemError: It cannot be read, is not such a file, or is larger than ``MAX_FILE_BYTES``.
+    Sizes are checked before anything is unpacked, so memory is bounded by twice ``MAX_FILE_BYTES``. Raise
+    FileNotFoundError if there is no file, and ProblemError if it cannot be read or is no such file.
     """
     details: dict[str, Any] = {"name": "path", "value": str(checked_path(path))}
     try:
@@ -159,9 +150,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
     """Open a regular file of at most ``MAX_FILE_BYTES`` for reading; refuse links, which another user may have made.
 
-    Raises:
-        OSError: It cannot be opened.
-        ProblemError: It is a link, not regular, or too large.
+    Raises OSError if it cannot be opened, and ProblemError if it is a link, not regular, or too large.
     """
     try:
         return open_regular(path, MAX_FILE_BYTES, links=False)
@@ -174,12 +163,6 @@ def checked_path(path: Any) -> str | os.PathLike[str]:
     if not isinstance(path, str | os.PathLike):
         raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
     return path
-
-
-def check_regular(path: Any, status: os.stat_result) -> None:
-    """Raise ProblemError if a path is not a regular file but, for example, a folder, a pipe or a device."""
-    if not stat.S_ISREG(status.st_mode):
-        raise ProblemError(f"{path} is not a file, but a folder, a pipe or a device", name="path", value=str(path))
 
 
 def check_contents(path: Any, stream: IO[bytes], size: int) -> None:

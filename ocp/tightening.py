@@ -28,8 +28,7 @@ class TighteningSettings:
     """Settings of :func:`tighten`, which tightens the limits of a plan.
 
     Attributes:
-        places: Evaluation points per interval and polynomial degree of the plan.
-        rounds: Maximum number of rounds.
+        places, rounds: Evaluation points per interval and polynomial degree of the plan, and maximum number of rounds.
         followed: Assumed response of the plan to a change of a bound, as a share of the change, until it is observed.
         least_followed: Response below which a plan counts as unaffected by a bound.
     """
@@ -160,10 +159,8 @@ def _places(
     """Return the bounded quantity that each variable ("x") and constraint ("g") represents, and its mesh intervals.
 
     The quantity is an index among the stacked states, controls and path constraints, or -1. The indices of two
-    intervals, left and right, differ at a node between intervals.
-
-    Args:
-        shared: Whether a control at a node belongs to both intervals; otherwise it, and rows with it, may jump there.
+    intervals, left and right, differ at a node between intervals. Unless ``shared``, a control at a node, and rows with
+    it, belong to one interval and may jump there.
     """
     entry_of = np.full(max(int(index.max(initial=0)) for index in form.bounds.places.values()) + 1, -1)
     offsets = {"state": 0, "initial": 0, "terminal": 0, "control": form.nx, "path": form.nx + form.nu}
@@ -212,9 +209,8 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest violation of the lower and upper bounds in each mesh interval, and the interval ends, s.
-
-    Shapes (2, N, m) and (N + 1,).
+    """Return the largest violation of both bounds in each mesh interval (2, N, m), and the ends (N + 1,) of the
+    intervals, s.
     """
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1

@@ -3,8 +3,7 @@
 No other package draws.
 """
 
-from ocp.app.check.data_checks import Fault
-from ocp.app.check.joint_limits import Row
+from ocp.app.check.joint_limits import Fault, Row
 from ocp.app.check.verdict import Check, CheckTolerances, Interpretation, check_trajectory
 
 __all__ = ["Check", "CheckTolerances", "Fault", "Interpretation", "Row", "check_trajectory"]

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, footprint, lock_joints, rectangle, with_load
 from models.checks import Array
-from models.files import INPUT_LIMITS, cache_files, cache_folder
+from models.files import cache_files, cache_folder
 from models.shapes.mesh_files import read_mesh
 from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
@@ -25,12 +25,12 @@ from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_
 from ocp.app.files.exchange import ROBOT_LANGUAGES
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.settings import read_obstacles
-from ocp.app.files.task_file import Task, read_task
+from ocp.app.files.task_file import read_task
 from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
 from ocp.app.view.player import PageServer, build_page
 from ocp.app.view.report import report_of_check, report_of_plan
 from ocp.console import Progress
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, sample_times
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.tasks.goals import Scene
@@ -48,20 +48,13 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     by_name = {kind: dict(getattr(options, kind)) for kind in ("velocity", "acceleration", "jerk", "torque")}
     limits = replace(limits_by_name(robot, {kind: of for kind, of in by_name.items() if of}), friction=options.friction)
     obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
+    ignored, folders = tuple(options.ignore), tuple(options.folder)
     scene = Scene(
-        obstacles,
-        options.clearance,
-        tuple(options.ignore),
-        options.srdf,
-        tuple(options.folder),
-        "skip" if options.no_meshes else "raise",
+        obstacles, options.clearance, ignored, options.srdf, folders, "skip" if options.no_meshes else "raise"
     )
     progress("reading the trajectory")
-    joint_names = [joint.name for joint in robot.joints if joint.moves]
-    columns = None if options.columns is None else [name.strip() for name in options.columns.split(",")]
-    raw = read_trajectory(
-        options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=joint_names
-    )
+    names, columns = [joint.name for joint in robot.joints if joint.moves], _names(options.columns)
+    raw = read_trajectory(options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=names)
     machine, notes = machine_of(options, robot, raw)
     check = check_trajectory(
         machine,
@@ -100,26 +93,85 @@ def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) ->
 
 
 def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion plan`: plan the motion of a task file and write its outputs."""
+    """Run `selfmotion plan`: plan and audit the motion of a task file, and write its outputs."""
     progress("reading the task")
     task = read_task(options.task, options.output_folder)
+    outputs = task.outputs if options.output is None else task.outputs | {"plan": options.output}
+
+    def checked(kind: str, file: Path) -> Path:
+        anywhere = kind == "plan" and options.output is not None
+        return checked_output(kind, file, None if anywhere else task.output_folder, options.force)
+
+    for kind, file in outputs.items():  # check the outputs before the user waits for the plan
+        checked(kind, file)
     progress("planning")
-    return run_task(task, options.output, progress, options.force)
+    result = plan(task.machine, task.tasks, **task.options, progress=progress)
+    sample_times("period", task.period, result.horizon)
+    progress("audit")
+    audit = result.audit()
+    for kind, path in {kind: checked(kind, file) for kind, file in outputs.items()}.items():
+        progress(f"writing {path.name}")
+        WRITERS[kind](result, path, task.period, task.file)
+    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
+    written = [f"written: {file}" for file in outputs.values()] or [hint]
+    margin = result.margin().sentence if audit.passed else ""
+    lines = [str(result), f"The plan {audit.sentence}.", *([f"It {margin}."] if margin else []), *written]
+    data = {
+        "passed": audit.passed,
+        "verdict": audit.sentence,
+        "margin": margin,
+        "cost": result.cost,
+        "bound": result.bound,
+        "duration": result.horizon,
+        "joints": result.names,
+        "start": result.at(0.0)["joints"],
+        "candidates": [
+            {"cost": candidate.cost, "reason": None if candidate.reason is None else str(candidate.reason)}
+            for candidate in result.candidates
+        ],
+        "audit": [{name: getattr(finding, name) for name in FINDING_FIELDS} for finding in audit.findings],
+        "written": {kind: str(file) for kind, file in outputs.items()},
+    }
+    if isinstance(result, SegmentedPlan):
+        names = ("time", "before", "after", "duration", "failure")
+        data["fewest"] = result.fewest
+        data["segments"] = [
+            {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
+            for begin, segment in zip(result.start_times, result.segments, strict=True)
+        ]
+        data["reconfigurations"] = [{name: getattr(each, name) for name in names} for each in result.reconfigurations]
+    return (0 if audit.feasible else 1), "\n".join(lines), data
 
 
 def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion export`: write a plan in another file format."""
+    """Run `selfmotion export`: write a plan in the format that the suffix of the file names."""
     progress("writing")
-    joints = None if options.joints is None else [name.strip() for name in options.joints.split(",")]
-    export_plan(Plan.load(options.plan), options.file, options.period, options.force, joints=joints)
-    return 0, f"written: {options.file}", {"written": str(options.file)}
+    file, known = options.file, tuple(SUFFIXES[kind][0] for kind in EXPORT_KINDS)
+    kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
+    if kind is None:
+        words = f"{file}: a plan can be exported as {', '.join(known)}; end the name with one of these"
+        raise ProblemError(words, name="file", value=str(file), limit=known)
+    plan, path = Plan.load(options.plan), checked_output(kind, file, force=options.force)
+    if options.joints is None:
+        WRITERS[kind](plan, path, options.period, "")
+    elif kind in ROBOT_LANGUAGES:
+        write_robot_program(plan, path, period=options.period, joints=_names(options.joints))
+    else:
+        words = f"{file}: joints can be selected only for robot programs; export it without --joints"
+        raise ProblemError(words, name="joints", value=options.joints, limit=tuple(ROBOT_LANGUAGES))
+    return 0, f"written: {file}", {"written": str(file)}
+
+
+def _names(text: str | None) -> list[str] | None:
+    """Return the names in a list that commas separate; None without a list."""
+    return None if text is None else [name.strip() for name in text.split(",")]
 
 
 def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion report`: audit a plan and write an HTML report of it."""
     file = checked_output("report", options.file, force=options.force)
     plan = Plan.load(options.plan)
-    check_period(plan, options.period)
+    sample_times("period", options.period, plan.horizon)
     progress("audit")
     title = options.title or ": ".join(dict.fromkeys((plan.machine.robot.name, options.plan.stem)))
     report = report_of_plan(plan, options.period, title)
@@ -175,25 +227,22 @@ def motions_of(options: argparse.Namespace) -> list[Any]:
     base_names = [file.name for file in files]
     names = [file.name if base_names.count(file.name) == 1 else str(file) for file in files]
     names[: len(options.name)] = options.name[: len(files)]
-
-    machine: Any = None
     tolerances: dict[str, Any] = {"tolerances": dict(options.tolerance)} if options.tolerance else {}
+    machine: Any = None
     if options.robot is not None:
         robot = read_robot(options)
         machine = FreeFloating(robot) if options.floating else FixedBase(robot, *base_pose(options))
-        states = {"joints": options.joints, "base": options.base}
-        motions = [animate_solution(Solution.load(options.plan), machine, names[0], **states, **tolerances)]
-    else:
-        plan = Plan.load(options.plan)
-        machine, motions = plan.machine, [animate_plan(plan, names[0], **tolerances)]
-    for file, name in zip(options.beside, names[1:], strict=True):
-        if file.suffix.lower() != ".npz":
+    motions: list[Any] = []
+    for file, name in zip(files, names, strict=True):
+        if motions and file.suffix.lower() != ".npz":
             joint_names = [joint.name for joint in machine.robot.joints if joint.moves]
             motions.append(animate_trajectory(read_trajectory(file, joints=joint_names), machine, name))
         elif options.robot is not None:
+            states = {"joints": options.joints, "base": options.base}
             motions.append(animate_solution(Solution.load(file), machine, name, **states, **tolerances))
         else:
             motions.append(animate_plan(Plan.load(file), name, **tolerances))
+            machine = motions[0].machine
     return motions
 
 
@@ -244,112 +293,6 @@ def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
 
 FINDING_FIELDS = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
 """Fields of an audit finding that the JSON output contains."""
-
-
-def run_task(
-    task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
-) -> tuple[int, str, Any]:
-    """Plan and audit the motion of a task file, write the outputs, and return exit status, text and contents of JSON.
-
-    Args:
-        task: Contents of the task file.
-        output: File of the plan, in any folder; None: as in the task.
-        progress: Function that is called with the name of each stage.
-        force: Whether files that selfmotion did not write are overwritten.
-
-    Raises:
-        ProblemError: The task is infeasible or invalid, or an output may not be written.
-        SolveError: No motion passes its audit; the message gives the reasons.
-    """
-    outputs = task.outputs if output is None else task.outputs | {"plan": output}
-    unrestricted = () if output is None else ("plan",)
-
-    def checked(kind: str, file: Path) -> Path:
-        return checked_output(kind, file, None if kind in unrestricted else task.output_folder, force)
-
-    def write(result: Plan, files: dict[str, Path]) -> None:
-        for kind, path in {kind: checked(kind, file) for kind, file in files.items()}.items():
-            progress(f"writing {path.name}")
-            WRITERS[kind](result, path, task.period, task.file)
-
-    for kind, file in outputs.items():  # check the outputs before the user waits for the plan
-        checked(kind, file)
-    result = plan(task.machine, task.tasks, **task.options, progress=progress)
-    check_period(result, task.period)
-    progress("audit")
-    audit = result.audit()
-    write(result, outputs)
-    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
-    written = [f"written: {file}" for file in outputs.values()] or [hint]
-    margin = result.margin().sentence if audit.passed else ""
-    lines = [str(result), f"The plan {audit.sentence}.", *([f"It {margin}."] if margin else []), *written]
-    data = {
-        "passed": audit.passed,
-        "verdict": audit.sentence,
-        "margin": margin,
-        "cost": result.cost,
-        "bound": result.bound,
-        "duration": result.horizon,
-        "joints": result.names,
-        "start": result.at(0.0)["joints"],
-        "candidates": [
-            {"cost": candidate.cost, "reason": None if candidate.reason is None else str(candidate.reason)}
-            for candidate in result.candidates
-        ],
-        "audit": [{name: getattr(finding, name) for name in FINDING_FIELDS} for finding in audit.findings],
-        **_segments(result),
-        "written": {kind: str(file) for kind, file in outputs.items()},
-    }
-    return (0 if audit.feasible else 1), "\n".join(lines), data
-
-
-def _segments(result: Plan) -> dict[str, Any]:
-    """Return JSON entries for a plan's segments and the reconfigurations between segments; {} for other plans."""
-    if not isinstance(result, SegmentedPlan):
-        return {}
-    names = ("time", "before", "after", "duration", "failure")
-    return {
-        "fewest": result.fewest,
-        "segments": [
-            {"begin": begin, "duration": segment.horizon, "cost": segment.cost, "bound": segment.bound}
-            for begin, segment in zip(result.start_times, result.segments, strict=True)
-        ],
-        "reconfigurations": [{name: getattr(each, name) for name in names} for each in result.reconfigurations],
-    }
-
-
-def export_plan(
-    plan: Plan, file: Path, period: float, force: bool = False, *, joints: Sequence[str] | None = None
-) -> None:
-    """Write a plan to a file in the format that the file's suffix names; `joints` are those of a robot program.
-
-    Raises:
-        ProblemError: The suffix is unknown, the period is not positive, selfmotion did not write an existing file and
-            `force` is False, or joints are given for another format.
-    """
-    kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
-    if kind is None:
-        known = tuple(SUFFIXES[kind][0] for kind in EXPORT_KINDS)
-        words = f"{file}: a plan can be exported as {', '.join(known)}; end the name with one of these"
-        raise ProblemError(words, name="file", value=str(file), limit=known)
-    path = checked_output(kind, file, force=force)
-    check_period(plan, period)
-    if joints is None:
-        WRITERS[kind](plan, path, period, "")
-    elif kind in ROBOT_LANGUAGES:
-        write_robot_program(plan, path, period=period, joints=joints)
-    else:
-        words = f"{file}: joints can be selected only for robot programs; export it without --joints"
-        raise ProblemError(words, name="joints", value=joints, limit=tuple(ROBOT_LANGUAGES))
-
-
-def check_period(plan: Plan, period: float) -> None:
-    """Raise ProblemError if the sampling period of a plan is not positive or gives too many samples."""
-    require.positive("period", period)
-    count, most = plan.horizon / period, INPUT_LIMITS.count
-    if count > most:
-        words = f"a period of {period:g} s gives {count:.3g} samples; at most {most} can be written"
-        raise ProblemError(words, name="period", value=period, limit=plan.horizon / most)
 
 
 def _yaml(plan: Plan, file: Path, period: float) -> None:

@@ -2,9 +2,7 @@
 
 Results are sent to the driver, the process that runs the batch, so the machines need no common folder. A cluster
 started here uses TLS with a certificate of its own: no other user of the machine can send it tasks or read results.
-
-A worker calls the function with one task after another and reports each result or error. It caches what several tasks
-share, such as a robot or a prepared problem.
+A worker calls the function with one task after another and caches what several tasks share, such as a robot.
 """
 
 from __future__ import annotations
@@ -20,14 +18,25 @@ import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
 from models.errors import DetailedError, ModelError
-from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
+from ocp.app.batch.result_store import (
+    Payload,
+    Result,
+    ResultStore,
+    canonical_text,
+    digest_of,
+    pack_result,
+    row_of,
+    unpack_result,
+)
 from ocp.errors import ProblemError, SolveError
 
 Function = Callable[..., Any]
@@ -46,40 +55,17 @@ _LOCK = threading.RLock()
 """Lock that makes the threads of a worker take turns, because CasADi expressions are not thread-safe."""
 
 
-def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
-    """Run the tasks of a batch one after the other in a worker, and return the payloads of their results.
-
-    Each job is a task as JSON text and, as its initial guess, the payload of a similar task or None. No job is started
-    after `limit_s` seconds.
-    """
-    began, results = time.perf_counter(), list[Payload]()
-    for task, guess in jobs:
-        results.append(attempt(function, task, near, guess))
-        if time.perf_counter() - began > limit_s:
-            break
-    return results
-
-
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call the function of a batch with one task, given as JSON text; return the payload of its result or exception.
-
-    If `with_guess` is true, the result of a similar task, `guess`, is the second argument.
-
-    Returns:
-        The payload of the result, or of the name and message of the function's exception.
-
-    Raises:
-        WorkerFailure: The disk is full.
+    """Call a function with a task, given as JSON text, and if `with_guess` with the result of a similar task; return
+    the payload of its result, or of its exception. Raise WorkerFailure if the disk is full.
     """
     with _LOCK:
         began = time.perf_counter()
         _INPUTS.clear()
         try:
-            arguments = (
-                (json.loads(task), None if guess is None else unpack_result(guess))
-                if with_guess
-                else (json.loads(task),)
-            )
+            arguments = [json.loads(task)]
+            if with_guess:
+                arguments.append(None if guess is None else unpack_result(guess))
             try:
                 result = pack_result(function(*arguments))
             except BaseException as error:  # of any kind, so that the other tasks continue
@@ -167,14 +153,11 @@ class EngineSettings:
 
     Attributes:
         deaths: Number of ended workers after which a task is given up.
-        chunk: Duration of the tasks that are sent together, s: sending takes Dask some ms, so short tasks are grouped.
         patience: Time after which a scheduler that does not answer is considered lost, s.
-        recount: Time between two counts of the workers, s.
-        closing: Largest time to wait for ended workers at the end of a batch, s.
+        recount, closing: Time between two counts of the workers, and to wait for ended workers at the end, s.
     """
 
     deaths: int = 3
-    chunk: float = 0.05
     patience: float = 10.0
     recount: float = 2.0
     closing: float = 0.7
@@ -189,12 +172,8 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Outcome of a job: the payload of its result, or None if the job must be sent again.
-
-    Attributes:
-        key: Key of the task.
-        payload: Payload of the result, or None.
-        deaths: Number of workers that ended, for whatever reason, while they had the task.
+    """Outcome of a job: its key, the payload of its result (None if it must be sent again), and the number of ended
+    workers.
     """
 
     key: str
@@ -203,8 +182,7 @@ class Outcome(NamedTuple):
 
 
 class Engine:
-    """Context manager that runs jobs on the workers of a Dask cluster, and on exit cancels the jobs or ends the
-    workers.
+    """Context manager that runs jobs on the workers of a Dask cluster; on exit it cancels the jobs or ends the workers.
 
     Args:
         function: Function that Dask sends to the workers: by name, or by code if it is defined in the script.
@@ -235,11 +213,9 @@ class Engine:
         self._foreign_processes = set(multiprocessing.active_children())
         self._configuration = ExitStack()
         self._finished: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._running: dict[int, tuple[Any, list[Job]]] = {}
+        self._running: dict[int, tuple[Any, Job]] = {}
         self._name, self._count = secrets.token_hex(4), 0
         self._threads, self._counted, self._heard = 0, -settings.recount, time.monotonic()
-        self._task_seconds = settings.chunk  # running mean
-        self._chunk_size = 1  # tasks sent together
 
     def __enter__(self) -> Engine:
         if not isinstance(self._cluster, int | str):
@@ -325,7 +301,7 @@ class Engine:
         return not self._running
 
     def free_slots(self) -> int:
-        """Return the number of groups of jobs that may be sent now: one group for each idle thread of the workers.
+        """Return the number of idle threads of the workers, each of which can be sent one job.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.
         """
@@ -338,50 +314,35 @@ class Engine:
                 self._threads = sum(self._client.nthreads().values())
         return max(0, self._threads - len(self._running))
 
-    def share(self, ready: int) -> int:
-        """Return how many of `ready` waiting jobs to send as one group, so that each thread gets several groups."""
-        return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
-
-    def submit(self, jobs: list[Job]) -> None:
-        """Send jobs to one worker, which runs them in sequence."""
+    def submit(self, job: Job) -> None:
+        """Send a job to a worker."""
         self._count += 1
-        number = self._count
-        future = self._client.submit(
-            attempts,
-            self._function,
-            [(job.task, job.guess) for job in jobs],
-            self._near,
-            self.settings.chunk,
-            key=f"{self._function.__name__}-{jobs[0].key}-{self._name}-{number}",
-            pure=False,
-        )
-        self._running[number] = future, jobs
+        number, key = self._count, f"{self._function.__name__}-{job.key}-{self._name}-{self._count}"
+        arguments = self._function, job.task, self._near, job.guess
+        future = self._client.submit(attempt, *arguments, key=key, pure=False)
+        self._running[number] = future, job
         future.add_done_callback(lambda _: self._finished.put(number))
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Wait at most some seconds until a job finishes, and return the outcomes of all jobs that have finished by
-        then.
-        """
+        """Wait at most some seconds until a job finishes, and return the outcomes of all jobs that have finished."""
         self._check_scheduler()
         numbers = []
         with suppress(queue.Empty):
             numbers.append(self._finished.get(timeout=seconds))
             while True:
                 numbers.append(self._finished.get_nowait())
-        finished = [self._running.pop(number) for number in numbers if number in self._running]
-        return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
+        return [self._outcome(*self._running.pop(number)) for number in numbers if number in self._running]
 
-    def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Return the outcomes of jobs that were sent together; the payload is None for jobs whose worker was lost."""
+    def _outcome(self, future: Any, job: Job) -> Outcome:
+        """Return the outcome of a job that has finished."""
         try:
-            payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
+            return Outcome(job.key, Payload(*future.result(timeout=self.settings.patience)))
         except WorkerFailure:
             raise
         except self._dask.KilledWorker as error:
-            self._chunk_size = 1
-            return [Outcome(job.key, None, error.allowed_failures + 1) for job in jobs]
+            return Outcome(job.key, None, error.allowed_failures + 1)
         except self._lost:  # the result was lost with its worker or with the scheduler
-            return [Outcome(job.key, None) for job in jobs]
+            return Outcome(job.key, None)
         except Exception as error:  # the function's exceptions are in the payload, so it cannot be loaded
             module, reason = self._function.__module__, str(error.__cause__ or error).partition("\n")[0]
             words = (
@@ -389,11 +350,6 @@ class Engine:
                 "be installed there; Client.upload_file sends a single file)"
             )
             raise ProblemError(words, name="function", value=self._function.__name__) from error
-        seconds = sum(payload.record["seconds"] for payload in payloads) / len(payloads)
-        self._task_seconds += (seconds - self._task_seconds) / 4
-        self._chunk_size = max(1, min(2 * self._chunk_size, int(self.settings.chunk / max(self._task_seconds, 1e-6))))
-        done = [Outcome(job.key, payload) for job, payload in zip(jobs, payloads, strict=False)]
-        return done + [Outcome(job.key, None) for job in jobs[len(payloads) :]]  # not begun
 
     def _check_scheduler(self) -> None:
         """Raise SolveError if the scheduler is lost."""
@@ -406,16 +362,103 @@ class Engine:
 
 
 def checked_cluster(cluster: Any) -> Any:
-    """Return `cluster` if it is the address of a Dask scheduler or a `distributed.Client`, which stays open.
-
-    Raises:
-        ProblemError: It is neither.
-    """
+    """Return `cluster` if it is the address of a Dask scheduler or a `distributed.Client`; else raise ProblemError."""
     dask = sys.modules.get("distributed")
     if dask is not None and isinstance(cluster, dask.Client):
         return cluster
     if isinstance(cluster, str) and cluster.partition("://")[0] in SCHEMES and cluster.partition("://")[2]:
         return cluster
     words = "cluster must be a number of processes, the address of a scheduler such as tcp://host:8786, or a Client, "
-    words += f"not {cluster!r}"
-    raise ProblemError(words, name="cluster", value=cluster)
+    raise ProblemError(f"{words}not {cluster!r}", name="cluster", value=cluster)
+
+
+# ---- the tasks of a batch ------------------------------------------------------------------------------------------
+
+
+class PendingTasks:
+    """The tasks of a batch that have no result yet."""
+
+    def __init__(
+        self,
+        store: ResultStore,
+        texts: dict[str, str],
+        parents: dict[str, str | None],
+        *,
+        results: dict[str, Result],
+        source: str,
+    ) -> None:
+        self.store, self.texts, self.parents, self.results, self.source = store, texts, parents, results, source
+        self.failures = 0
+        self.after: defaultdict[str, list[str]] = defaultdict(list)  # tasks that wait for their neighbour
+        self.ready: deque[str] = deque()
+        self.suspects: deque[str] = deque()  # tasks that were sent when a worker ended
+        self.isolated = ""  # the suspect that is sent alone
+        self.deaths: Counter[str] = Counter()
+        for key, parent in parents.items():
+            if key not in results:
+                if parent is None or parent in results:
+                    self.ready.append(key)
+                else:
+                    self.after[parent].append(key)
+
+    def run(self, engine: Engine) -> None:
+        """Run the tasks until none is pending."""
+        options: dict[str, Any] = {"desc": self.store.folder.name, "unit": "task", "disable": None, "leave": False}
+        with tqdm(total=len(self.texts), initial=len(self.results), file=sys.stderr, **options) as bar:
+            while len(self.results) < len(self.texts):
+                self._submit(engine)
+                outcomes = engine.wait(1.0)
+                for lost in (outcome for outcome in outcomes if outcome.payload is None):
+                    if lost.deaths:
+                        self._suspect(lost.key, lost.deaths, engine.settings.deaths)
+                    else:
+                        self.ready.appendleft(lost.key)
+                self._submit(engine)  # before writing, so that the workers do not wait
+                for outcome in outcomes:
+                    if outcome.payload is not None:
+                        self._end(outcome.key, outcome.payload)
+                bar.update(len(self.results) - bar.n)
+                if self.failures:
+                    bar.set_postfix(failed=self.failures, refresh=False)
+
+    def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
+        """Queue a task to run alone, because its worker ended; record the task as killed if too many workers ended."""
+        self.deaths[key] += deaths
+        if key == self.isolated and self.deaths[key] >= max_deaths:
+            self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
+        else:
+            self.suspects.append(key)
+
+    def _submit(self, engine: Engine) -> None:
+        """Send as many tasks as the workers can take; a task that may have killed a worker runs alone."""
+        if self.suspects or self.isolated:
+            if not engine.is_idle or not engine.free_slots():
+                return
+            self.isolated = self.suspects.popleft() if self.suspects else ""
+            if self.isolated:
+                engine.submit(self._job(self.isolated))
+                return
+        for _ in range(min(engine.free_slots(), len(self.ready))):
+            engine.submit(self._job(self.ready.popleft()))
+
+    def _job(self, key: str) -> Job:
+        """Return the job of a task, with the result of a similar task as its initial guess if there is one."""
+        parent = self._neighbour(key)
+        record = None if parent is None else self.store.read(parent)
+        return Job(key, self.texts[key], None if record is None else self.store.payload(record))
+
+    def _neighbour(self, key: str) -> str | None:
+        """Follow the chain of similar tasks from a task; return the key of the first that succeeded, or None."""
+        parent = self.parents[key]
+        while parent is not None and self.results[parent].status != "done":
+            parent = self.parents[parent]
+        return parent
+
+    def _end(self, key: str, payload: Payload) -> None:
+        """Store the result of a finished task, and queue the tasks that waited for this result."""
+        record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **payload.record}
+        record["inputs"] = {"source": self.source, **record["inputs"]}
+        self.store.write(record, payload.files)
+        self.results[key] = row_of(record, self.store)
+        self.failures += record["status"] != "done"
+        self.ready.extend(self.after.pop(key, ()))

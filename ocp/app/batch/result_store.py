@@ -3,14 +3,11 @@
     batch.json              the function, its version, the format
     results/ab/KEY.json     a record: task, status, value, cost, verdict, seconds, message
     results/ab/KEY.0.npz    plans and solutions of its value
-    lock                    held by the active driver; the system releases it when the driver ends for any reason
+    lock                    held by the driver, the process that runs the batch, until it ends for any reason
 
-The driver is the process that runs the batch. Data are numbers, texts, True, False, None, and lists and dictionaries of
-these, with names as keys. The canonical text of a task gives its key. Plans and solutions in a result are stored in
-files of their own, in the formats of the library. Nothing is pickled.
-
-Files are complete or absent. They are not synchronised to the disk: after a loss of power the last ones may be empty or
-truncated, which is detected and counts as missing.
+Data are numbers, texts, True, False, None, and lists and dictionaries of these, with names as keys. The canonical text
+of a task gives its key. Nothing is pickled. Files are complete or absent, but not synchronised to the disk: a loss of
+power may truncate the last ones, which is detected and counts as missing.
 """
 
 from __future__ import annotations
@@ -23,6 +20,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +29,7 @@ import numpy as np
 
 from models.files import INPUT_LIMITS
 from ocp.console import LOG
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, SolveError
 from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import END_RECORD, checked_path, open_unlinked, write_whole
@@ -53,11 +51,8 @@ class Payload(NamedTuple):
 def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
     """Convert a value to plain data: arrays and tuples become lists, NumPy numbers become Python numbers.
 
-    Args:
-        value: The value.
-        where: Name of the value in messages: ``task``, then ``task['x'][2]``.
-        extract: Function of a nested value and its place (names and indices) that returns whether to replace the value
-            by None.
+    `where` names the value in messages: ``task``, then ``task['x'][2]``. `extract` says of a nested value and its place
+    (names and indices) whether to replace it by None.
 
     Raises:
         ProblemError: The value contains something that is not data, or a number that is not finite; names the place.
@@ -103,11 +98,7 @@ def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bo
 
 
 def canonical_text(value: Any, where: str) -> str:
-    """Return the same JSON text for equal data: names are sorted, floats have all digits, and 1 differs from 1.0.
-
-    Raises:
-        ProblemError: As :func:`as_data`.
-    """
+    """Return the same JSON text for equal data: names are sorted, floats have all digits, and 1 differs from 1.0."""
     try:
         return json.dumps(as_data(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
     except ProblemError:
@@ -126,11 +117,7 @@ def pack_result(value: Any) -> Payload:
 
     The cost is that of a plan or solution, the ``"cost"`` of a dictionary or that of the only plan in it, or the number
     itself. The verdict is the ``"verdict"`` of a dictionary, or whether the audit of the only plan passes; otherwise
-    None.
-
-    Raises:
-        ProblemError: The result is not data, or contains nan.
-        OSError: There is no space for temporary files.
+    None. A result that is not data, or contains nan, raises ProblemError.
     """
     objects: list[tuple[Any, list[Any]]] = []
 
@@ -159,12 +146,7 @@ def pack_result(value: Any) -> Payload:
 
 
 def unpack_result(payload: Payload) -> Any:
-    """Convert a payload back to the result given to :func:`pack_result`; tuples and arrays have become lists.
-
-    Raises:
-        ProblemError: A file is damaged.
-        OSError: There is no space for temporary files.
-    """
+    """Convert a payload back to the result given to :func:`pack_result`; raise ProblemError if a file is damaged."""
     value = json.loads(json.dumps(payload.record["value"]))
     try:
         for entry, file in zip(payload.record["files"], payload.files, strict=True):
@@ -224,22 +206,15 @@ RECORD_FIELDS = {
 
 
 class ResultStore:
-    """Folder that stores the results of one function, one record for each task.
-
-    Attributes:
-        folder: The folder.
-        function, version: Function that computed the results, and its version.
-    """
+    """Folder that stores the results of one version of one function, one record for each task."""
 
     def __init__(self, folder: Path, function: str, version: str) -> None:
         self.folder, self.function, self.version = folder, function, version
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """Return the store of results that already exists in a folder.
-
-        Raises:
-            ProblemError: The folder is invalid, has no store, or has one of another format.
+        """Return the store of results that already exists in a folder; raise ProblemError if there is none of this
+        format.
         """
         path = checked_folder(folder)
         for link in (path / name for name in sorted(OWN_NAMES) if (path / name).is_symlink()):
@@ -265,11 +240,7 @@ class ResultStore:
     def of(cls, folder: Any, function: str, version: str, chosen: bool) -> ResultStore:
         """Return the store of the results of a function in a folder; create it if the folder is new or empty.
 
-        Args:
-            folder: The folder.
-            function: Name of the function.
-            version: Its version.
-            chosen: Whether the user chose the version; else it is that of the source.
+        `chosen` says whether the user chose the version; else it is that of the source.
 
         Raises:
             ProblemError: The folder belongs to another function, has results of another version, or has other files.
@@ -315,12 +286,7 @@ class ResultStore:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder during a `with` block; if another process has locked the folder, wait for its release.
-
-        Raises:
-            ProblemError: The file system of the folder has no locks.
-            OSError: The folder cannot be written.
-        """
+        """Lock the folder during a `with` block; if another process has locked the folder, wait for its release."""
         file = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o644)
         try:
             try:
@@ -362,11 +328,7 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Write the files of a record and then the record itself; replace existing links of the same names.
-
-        Raises:
-            OSError: A file cannot be written; no file is then incomplete.
-        """
+        """Write the files of a record and then the record itself; replace existing links of the same names."""
         path = self._place(record["key"])
         for link in (path.parent, path, *(file_at(path, i) for i in range(len(files)))):
             if os.path.islink(link):
@@ -379,12 +341,7 @@ class ResultStore:
         write_whole(path, lambda stream: stream.write(text), synced=False)
 
     def payload(self, record: dict[str, Any]) -> Payload:
-        """Return all data of one result: its record and the contents of the files that belong to it.
-
-        Raises:
-            OSError: A file is missing.
-            ProblemError: A file is a link, or too large.
-        """
+        """Return all data of one result: its record and the contents of the files that belong to it."""
         files = []
         for i in range(len(record["files"])):
             with open_unlinked(file_at(self._place(record["key"]), i)) as stream:
@@ -429,11 +386,7 @@ def file_at(place: Path, number: int) -> Path:
 
 
 def checked_folder(folder: Any) -> Path:
-    """Return a folder's absolute path after checks; the folder need not exist.
-
-    Raises:
-        ProblemError: The path is invalid, is that of a file, or of a remote store.
-    """
+    """Return a folder's absolute path, which need not exist; raise ProblemError if it is a file or a remote store."""
     path = Path(checked_path(folder))
     text = os.fspath(folder)
     if not isinstance(text, str) or not text or "\0" in text:
@@ -444,3 +397,80 @@ def checked_folder(folder: Any) -> Path:
     if any(place.is_file() for place in (path, *path.parents)):
         raise ProblemError(f"folder: {path} is not a folder", name="folder", value=str(path))
     return path.absolute()
+
+
+# ---- results -----------------------------------------------------------------------------------------------------
+
+COLUMNS = ("key", "status", "cost", "verdict", "seconds", "error", "message")
+
+
+@dataclass(frozen=True)
+class Result:
+    """Result of one task of a batch.
+
+    Attributes:
+        key: Name of the result in the folder.
+        task: The task.
+        status: ``done``; ``failed``: the function raised an exception, or returned nan or something that is not data;
+            ``killed``: the task ended at least three workers.
+        cost, verdict: Values that the function returned, or those of the plan that it returned; otherwise None.
+        seconds: Wall time of the call.
+        error, message: Name and text of the exception; "" if done.
+        neighbour: Key of the task whose result was the guess, or None.
+    """
+
+    key: str
+    task: Any
+    status: str
+    cost: float | None
+    verdict: Any
+    seconds: float
+    error: str
+    message: str
+    neighbour: str | None
+    scalars: Mapping[str, Any] = field(repr=False)
+    _store: ResultStore = field(repr=False, compare=False)
+
+    @property
+    def value(self) -> Any:
+        """Value that the function returned, read from the folder; arrays and tuples are lists, plans are `Plan`
+        objects.
+
+        Raises:
+            SolveError: The task is not done; gives the reason.
+            ProblemError: The record is missing or damaged.
+        """
+        if self.status != "done":
+            words = f"task {self.task!r} {self.status}: {self.error} {self.message}"
+            raise SolveError(words, name="task", value=self.task)
+        record = self._store.read(self.key)
+        if record is None:
+            words = f"the result {self.key} in {self._store.folder} is missing or damaged; run the batch again"
+            raise ProblemError(words, name="key", value=self.key)
+        return self._store.value(record)
+
+    def row(self) -> dict[str, Any]:
+        """Return the result as a table row: ``COLUMNS``, entries of the task as ``task.NAME``, of its value as
+        ``result.NAME``.
+
+        Longer entries of a task are given as JSON.
+        """
+        row: dict[str, Any] = {name: getattr(self, name) for name in COLUMNS}
+        row["verdict"] = scalar(self.verdict)
+        parts = self.task if isinstance(self.task, dict) else {"": self.task}
+        row |= {f"task.{name}" if name else "task": scalar(value) for name, value in parts.items()}
+        return row | {f"result.{name}": value for name, value in self.scalars.items()}
+
+
+def row_of(record: Mapping[str, Any], store: ResultStore) -> Result:
+    """Return the Result that a stored record describes."""
+    value = record["value"]
+    entries = value if isinstance(value, dict) else {}
+    scalars = {name: entry for name, entry in entries.items() if isinstance(entry, str | int | float)}
+    names = ("key", "task", "status", "cost", "verdict", "seconds", "error", "message", "neighbour")
+    return Result(**{name: record[name] for name in names}, scalars=scalars, _store=store)
+
+
+def scalar(value: Any) -> Any:
+    """Return a value as the content of a table cell: texts and numbers unchanged, other data as JSON."""
+    return value if value is None or isinstance(value, str | int | float) else json.dumps(value, ensure_ascii=False)

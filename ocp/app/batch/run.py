@@ -1,31 +1,36 @@
-"""Run many tasks with one function and store each result, so that an interrupted batch can be continued."""
+"""Run many tasks with one function, store each result so that an interrupted batch can be continued, and list all
+results.
+"""
 
 from __future__ import annotations
 
 import ast
+import csv
 import hashlib
 import inspect
+import io
 import json
 import os
 import sys
 import textwrap
-from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 import scipy
-from tqdm import tqdm
 
 from models.checks import NOT_NUMBERS, Array, check_entries, floats
+from models.errors import DetailedError
 from models.files import INPUT_LIMITS
-from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failure_payload
-from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
-from ocp.app.batch.table import Batch, Result, row_of
+from ocp.app.batch.engine import Engine, Function, PendingTasks, checked_cluster
+from ocp.app.batch.result_store import COLUMNS, STATUSES, Result, ResultStore, canonical_text, digest_of, key_of, row_of
 from ocp.errors import ProblemError, require
+from ocp.storage import cell, checked_path, write_text, write_whole
 
 MAX_WORKERS = 4096
+Group = str | Callable[[Any], Any]
 
 
 def run_batch(
@@ -81,9 +86,11 @@ def run_batch(
     """
     name = name_of(function)
     texts = texts_of(tasks)
-    is_count = cluster is None or isinstance(cluster, int)
-    count = worker_count(cluster) if is_count else MAX_WORKERS
-    if not is_count:
+    if cluster is None:
+        cluster = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    elif isinstance(cluster, int):
+        require.count("cluster", cluster, 1, MAX_WORKERS)
+    else:
         checked_cluster(cluster)
     names = names_of("near", near)
     statuses = names_of("again", (again,) if isinstance(again, str) else again)
@@ -115,10 +122,11 @@ def run_batch(
         try:
             with store.locked():
                 results |= recorded([key for key in texts if key not in results])  # by the driver that held the lock
-                pending = _PendingTasks(store, texts, parents, results, source)
+                pending = PendingTasks(store, texts, parents, results=results, source=source)
                 if len(results) < len(texts):
-                    count = min(count, len(texts) - len(results))
-                    with Engine(function, near=bool(names), cluster=count if is_count else cluster) as engine:
+                    if isinstance(cluster, int):
+                        cluster = min(cluster, len(texts) - len(results))
+                    with Engine(function, near=bool(names), cluster=cluster) as engine:
                         pending.run(engine)
         except OSError as error:
             if isinstance(error, ConnectionError):
@@ -133,103 +141,8 @@ def run_batch(
     return batch
 
 
-class _PendingTasks:
-    """The tasks of a batch that have no result yet."""
-
-    def __init__(
-        self,
-        store: ResultStore,
-        texts: dict[str, str],
-        parents: dict[str, str | None],
-        results: dict[str, Result],
-        source: str,
-    ) -> None:
-        self.store, self.texts, self.parents, self.results, self.source = store, texts, parents, results, source
-        self.failures = 0
-        self.after: defaultdict[str, list[str]] = defaultdict(list)  # tasks that wait for their neighbour
-        self.ready: deque[str] = deque()
-        self.suspects: deque[str] = deque()  # tasks that were sent when a worker ended
-        self.isolated = ""  # the suspect that is sent alone
-        self.deaths: Counter[str] = Counter()
-        for key, parent in parents.items():
-            if key not in results:
-                if parent is None or parent in results:
-                    self.ready.append(key)
-                else:
-                    self.after[parent].append(key)
-
-    def run(self, engine: Engine) -> None:
-        """Run the tasks until none is pending."""
-        options: dict[str, Any] = {"desc": self.store.folder.name, "unit": "task", "disable": None, "leave": False}
-        with tqdm(total=len(self.texts), initial=len(self.results), file=sys.stderr, **options) as bar:
-            while len(self.results) < len(self.texts):
-                self._submit(engine)
-                outcomes = engine.wait(1.0)
-                for lost in (outcome for outcome in outcomes if outcome.payload is None):
-                    if lost.deaths:
-                        self._suspect(lost.key, lost.deaths, engine.settings.deaths)
-                    else:
-                        self.ready.appendleft(lost.key)
-                self._submit(engine)  # before writing, so that the workers do not wait
-                for outcome in outcomes:
-                    if outcome.payload is not None:
-                        self._end(outcome.key, outcome.payload)
-                bar.update(len(self.results) - bar.n)
-                if self.failures:
-                    bar.set_postfix(failed=self.failures, refresh=False)
-
-    def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Queue a task to run alone, because its worker ended; record the task as killed if too many workers ended."""
-        self.deaths[key] += deaths
-        if key == self.isolated and self.deaths[key] >= max_deaths:
-            self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
-        else:
-            self.suspects.append(key)
-
-    def _submit(self, engine: Engine) -> None:
-        """Send as many tasks as the workers can take; a task that may have killed a worker runs alone."""
-        if self.suspects or self.isolated:
-            if not engine.is_idle or not engine.free_slots():
-                return
-            self.isolated = self.suspects.popleft() if self.suspects else ""
-            if self.isolated:
-                engine.submit([Job(self.isolated, self.texts[self.isolated], self._guess(self.isolated))])
-                return
-        for _ in range(engine.free_slots()):
-            keys = [self.ready.popleft() for _ in range(min(engine.share(len(self.ready)), len(self.ready)))]
-            if not keys:
-                break
-            engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
-
-    def _guess(self, key: str) -> Payload | None:
-        """Return the stored result of a similar task as initial guess for a task; None if there is no such result."""
-        parent = self._neighbour(key)
-        record = None if parent is None else self.store.read(parent)
-        return None if record is None else self.store.payload(record)
-
-    def _neighbour(self, key: str) -> str | None:
-        """Follow the chain of similar tasks from a task; return the key of the first that succeeded, or None."""
-        parent = self.parents[key]
-        while parent is not None and self.results[parent].status != "done":
-            parent = self.parents[parent]
-        return parent
-
-    def _end(self, key: str, payload: Payload) -> None:
-        """Store the result of a finished task, and queue the tasks that waited for this result."""
-        record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **payload.record}
-        record["inputs"] = {"source": self.source, **record["inputs"]}
-        self.store.write(record, payload.files)
-        self.results[key] = row_of(record, self.store)
-        self.failures += record["status"] != "done"
-        self.ready.extend(self.after.pop(key, ()))
-
-
 def texts_of(tasks: Any) -> dict[str, str]:
-    """Return the canonical text of each distinct task, keyed by the key of the task.
-
-    Raises:
-        ProblemError: `tasks` is not a list, or one of them is not data.
-    """
+    """Return the canonical text of each distinct task by its key; raise ProblemError for what is no list of data."""
     if isinstance(tasks, str | bytes | dict):
         raise ProblemError(f"tasks must be a list of tasks, not one: {tasks!r}", name="tasks", value=tasks)
     texts: dict[str, str] = {}
@@ -248,14 +161,6 @@ def texts_of(tasks: Any) -> dict[str, str]:
     return texts
 
 
-def worker_count(count: int | None) -> int:
-    """Return the number of processes to start; by default one for each core that this process may use."""
-    if count is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    require.count("cluster", count, 1, MAX_WORKERS)
-    return count
-
-
 def names_of(argument: str, names: Any) -> tuple[str, ...]:
     """Return a list of names as a tuple; raise ProblemError if the argument is not a list of names."""
     if isinstance(names, str) or not isinstance(names, Collection):
@@ -267,8 +172,8 @@ def name_of(function: Any) -> str:
     """Return the name under which a function's results are stored, ``module:name``; a script is named after its file.
 
     Raises:
-        ProblemError: A worker cannot find the function by name, as for a lambda, a nested function, a method, or a
-            function typed at a prompt; or this process is itself a worker that reads the script of its driver.
+        ProblemError: A worker cannot find the function by name, as for a lambda, a nested function or a method; or this
+            process is itself a worker that reads the script of its driver.
     """
     if sys.modules.get("__mp_main__") not in (None, sys.modules["__main__"]):  # a worker's import
         words = "run_batch: workers import the script that calls it; call it under if __name__ == '__main__':"
@@ -307,15 +212,10 @@ def source_version(function: Any) -> str:
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
     """Return for each task the key of its neighbour, the similar task whose result is its initial guess.
 
-    The first task has None; neighbours come first in the order of the dictionary. The tasks alone determine the
-    neighbours. Ordered by their keys, which looks random, they form generations of 1, 1, 2, 4, 8, ... tasks, and the
-    neighbour of a task is the nearest task of all earlier generations. Neighbours thus come closer as the tasks get
-    denser, the tasks of one generation can run in parallel, and no chain is longer than log2 of the number of tasks.
-
-    Args:
-        tasks: Tasks by key.
-        names: Names of the numbers (or lists of numbers) in the tasks that span the space of the distance; each is
-            divided by its range.
+    The first task has None; neighbours come first in the order of the dictionary. Ordered by their keys, which looks
+    random, the tasks form generations of 1, 1, 2, 4, 8, ... tasks. The neighbour of a task is the nearest task of all
+    earlier generations, in the space of the numbers `names` of a task, each divided by its range. Neighbours thus come
+    closer as the tasks get denser, and no chain is longer than log2 of the number of tasks.
 
     Raises:
         ProblemError: A task lacks these numbers, or has not as many as the others; names the task.
@@ -354,3 +254,168 @@ def coordinates_of(task: Any, names: Sequence[str]) -> Array:
             raise ProblemError(words, name=name, value=value) from error
         parts.append(part)
     return np.concatenate(parts) if parts else np.zeros(0)
+
+
+# ---- results -----------------------------------------------------------------------------------------------------
+
+
+class BatchError(DetailedError, RuntimeError):
+    """Error raised when tasks of a batch failed, after all other tasks are done and all results are stored.
+
+    Attributes:
+        batch: The results.
+        value: Number of failed tasks.
+    """
+
+    def __init__(self, message: str = "", batch: Batch | None = None, **details: Any) -> None:
+        super().__init__(message, **details)
+        self.batch = batch
+
+
+class Batch:
+    """Results of a batch in the order of its tasks; equal tasks share one result.
+
+    Attributes:
+        folder: Folder of the results.
+        results: All results.
+    """
+
+    def __init__(self, store: ResultStore, results: Sequence[Result]) -> None:
+        self.folder = require.instance("Batch: store", store, ResultStore).folder
+        self.results = require.each("Batch: results", results, Result)
+
+    def __len__(self) -> int:
+        return len(self.results)
+
+    def __iter__(self) -> Iterator[Result]:
+        return iter(self.results)
+
+    def __getitem__(self, index: int) -> Result:
+        return self.results[index]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of results of each status, keyed by status."""
+        return dict(Counter(result.status for result in self.results))
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items()) or "no tasks"
+        lines = [f"{self.folder}: {counts}"]
+        reasons = Counter(f"{r.status}: {r.error} {r.message}" for r in self.results if r.status != "done")
+        lines += [f"  {count} x {reason}" for reason, count in reasons.most_common(5)]
+        return "\n".join(lines)
+
+    @property
+    def summary(self) -> str:
+        """One line with the numbers of finished and failed tasks, the first error, and how to repeat failed tasks."""
+        done = self.counts.get("done", 0)
+        counts = f"{self.folder.name}: {len(self)} tasks: {done} done, {len(self) - done} failed"
+        first = next((result for result in self.results if result.status != "done"), None)
+        if first is None:
+            return counts
+        message = first.message.partition("\n")[0]
+        return f'{counts}, first: {first.error or first.status}: {message}; run again with again="failed"'
+
+    def check(self) -> None:
+        """Raise BatchError with a summary of the batch if a task failed, or crashed the processes that ran it."""
+        if count := len(self) - self.counts.get("done", 0):
+            raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
+
+    def best(self, by: Group) -> dict[Any, Result]:
+        """Return the lowest-cost result of each group of tasks, among finished results whose verdict is not False.
+
+        Args:
+            by: Name of an entry of the tasks, or a function of a task; its value, a text or number, is the group.
+
+        Raises:
+            ProblemError: A task has no such entry, or a group is not a text or number.
+        """
+        if not isinstance(by, str) and not callable(by):
+            words = f"best: by must be a name in the tasks or a function of a task, not {by!r}"
+            raise ProblemError(words, name="by", value=by)
+        best: dict[Any, Result] = {}
+        for result in self.results:
+            group = by(result.task) if callable(by) else entry(result.task, by)
+            if group is not None and not isinstance(group, str | int | float):
+                words = f"best: a group must be a text or a number, not {group!r}"
+                raise ProblemError(words, name="by", value=group)
+            if result.status != "done" or result.cost is None or result.verdict is False:
+                continue
+            if group not in best or result.cost < best[group].cost:  # type: ignore[operator]
+                best[group] = result
+        return best
+
+    # ---- tables ------------------------------------------------------------------------------------------------
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return all results as table rows with the same columns; a missing value is None."""
+        rows = [result.row() for result in self.results]
+        columns = dict.fromkeys(COLUMNS) | dict.fromkeys(name for row in rows for name in row)
+        return [{name: row.get(name) for name in columns} for row in rows]
+
+    def write_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the rows as CSV in full precision; cells without a value are empty.
+
+        A text that a spreadsheet would take for a formula (it begins with = + - @ or a tab) begins with the %XX of that
+        character; so does a text that begins with %.
+
+        Raises:
+            ProblemError: The path is invalid.
+            OSError: The file cannot be written.
+        """
+        checked_path(path)
+        rows = self.rows()
+        stream = io.StringIO()
+        writer = csv.DictWriter(stream, rows[0] if rows else COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: cell(value) for name, value in row.items()} for row in rows)
+        write_text(path, stream.getvalue())
+
+    def write_parquet(self, path: str | os.PathLike[str]) -> None:
+        """Write the rows as a Parquet file; a column that contains both numbers and texts is written as texts.
+
+        Raises:
+            ProblemError: The path is invalid, or pyarrow is not installed.
+            OSError: The file cannot be written.
+        """
+        checked_path(path)
+        try:
+            import pyarrow
+            from pyarrow import parquet
+        except ImportError as error:
+            words = "write_parquet: pyarrow is not installed; pip install pyarrow, or use write_csv"
+            raise ProblemError(words, name="path", value=str(path)) from error
+        rows = self.rows()
+        columns = {name: uniform([row[name] for row in rows]) for name in (rows[0] if rows else COLUMNS)}
+        table = pyarrow.table(columns)
+        write_whole(path, lambda stream: parquet.write_table(table, stream))
+
+
+def read_batch(folder: str | os.PathLike[str]) -> Batch:
+    """Return all results that are stored in a folder, ordered by their keys, without computing any.
+
+    Raises:
+        ProblemError: The folder is not that of a batch.
+    """
+    store = ResultStore.at(folder)
+    records = (store.read(key) for key in store.stored_keys())
+    return Batch(store, tuple(row_of(record, store) for record in records if record is not None))
+
+
+def entry(task: Any, name: str) -> Any:
+    """Return a named entry of a task; raise ProblemError if the task has no such entry."""
+    if not isinstance(task, dict) or name not in task:
+        raise require.unknown("entry of a task", name, task if isinstance(task, dict) else ())
+    return task[name]
+
+
+def uniform(values: list[Any]) -> list[Any]:
+    """Convert the values of a column to one type: booleans, numbers, or texts."""
+    present = [value for value in values if value is not None]
+    if all(isinstance(value, bool) for value in present):
+        return values
+    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in present)
+    if numbers and all(abs(value) < 2**53 for value in present if isinstance(value, int)):
+        whole = all(isinstance(value, int) for value in present)
+        return values if whole else [None if value is None else float(value) for value in values]
+    return [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]

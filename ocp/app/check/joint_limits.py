@@ -1,11 +1,11 @@
-"""Check a motion against joint limits, torque limits, and the conditions of a standing or floating base.
+"""Interpolate joint samples as controllers do, and check joint limits between the samples.
 
-Positions, velocities, accelerations and jerks are bounded at every time by the Bernstein coefficients of the
-interpolant; torques are evaluated several times in every interval. The digits of a file leave an error: a violation
-smaller than that error is reported but is not a fault.
-
-A standing base is checked by its zero moment point, the vertical force and friction; a floating base moves so that
-momentum is conserved.
+A file with positions alone is interpolated linearly, one with velocities by cubics (Hermite), and one with
+accelerations by quintics, which overestimate an acceleration that jumps. A quantity is therefore compared with a limit
+only as far as every motion through the samples needs it (`Motion.needed`), unless the rule of the controller is stated.
+Without velocities, any smooth motion through three samples has the acceleration 2 q[t0, t1, t2] at some time between
+them, and any through four the jerk 6 q[t0, t1, t2, t3]. A violation smaller than the rounding error of the file's
+digits is reported but is not a fault.
 """
 
 from __future__ import annotations
@@ -13,42 +13,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from functools import cached_property
+from math import comb
+from typing import Any, Literal, NamedTuple, TypeAlias
 
-import casadi as ca
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
-from models import (
-    FixedBase,
-    FreeFloating,
-    Machine,
-    Robot,
-    Standing,
-    inverse_dynamics,
-    momentum,
-    robot_inertia,
-    simplify,
-)
+from models import FixedBase, Robot
 from models.checks import Array, real
-from models.machines.standing import center_of_pressure
-from models.robot.dynamics import GRAVITY
-from models.spatial import cross, rotation_from_quaternion
-from ocp.app.check.data_checks import CleanedTrajectory, Fault
-from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
-from ocp.console import check_time
-from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require
 from ocp.motion.result.plan import ENDS, describe_ends
 from ocp.motion.tasks.limits import JointBounds, Limits
-from ocp.problem.values import Sampler
-from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
+from ocp.tolerances import LIMIT_SHARE
 
+Indices: TypeAlias = NDArray[np.intp]
+Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
 """Checked quantities of a joint, and the suffix that turns rad or m into the unit of the quantity."""
 
 
 class RowVerdict(StrEnum):
-    """Verdict on one quantity in the table of results of `selfmotion check`, such as the velocity of a joint."""
+    """Verdict on one quantity in the table of results of a check, such as the velocity of a joint."""
 
     OK = "ok"
     FAILED = "FAILED"
@@ -59,9 +46,9 @@ class RowVerdict(StrEnum):
     """Verdict on a value that is given as information, without a requirement."""
 
     @classmethod
-    def of(cls, failed: Any) -> RowVerdict:
-        """Return the verdict FAILED or OK for a value that has a limit."""
-        return cls.FAILED if failed else cls.OK
+    def of(cls, failed: Any, doubtful: Any = False) -> RowVerdict:
+        """Return the verdict on a value that has a limit: FAILED if it is certainly beyond, UNDECIDED if it may be."""
+        return cls.FAILED if failed else cls.UNDECIDED if doubtful else cls.OK
 
 
 @dataclass(frozen=True)
@@ -70,9 +57,7 @@ class Row:
 
     Attributes:
         name: Quantity, and joint or bodies.
-        value: Worst value, in `unit`.
-        limit: Limit, in `unit`; None if there is none.
-        unit: Unit of value and limit.
+        value, limit: Worst value, and limit (None if there is none), in `unit`.
         time: Time of the worst value, s.
         verdict: Verdict on the value.
         note: Method of the check, if it is not obvious.
@@ -94,13 +79,287 @@ class Row:
         return 2.0 if self.verdict in (RowVerdict.FAILED, RowVerdict.UNDECIDED) else nearness
 
 
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a trajectory, such as a violated limit or a jump: what is wrong, where, and by how much.
+
+    Attributes:
+        kind: "jump", "velocity", "clearance", "suspicion", ...
+        name: Joint, pair of bodies, or waypoint; "" if it concerns the whole trajectory.
+        text: Description of the fault.
+        time: Time of the worst violation, s; None if it holds throughout.
+        first: Time of the first violation, s.
+        value, limit: Worst value and allowed value.
+        unit: Unit of both values.
+        line: Line in the file, if the fault is in one line.
+    """
+
+    kind: str
+    name: str
+    text: str
+    time: float | None = None
+    first: float | None = None
+    value: float | None = None
+    limit: float | None = None
+    unit: str = ""
+    line: int | None = None
+
+    def __str__(self) -> str:
+        where = f"{self.name}: " if self.name else ""
+        return f"{self.kind}: {where}{self.text}"
+
+
+# ---- interpolation ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """Piecewise polynomials between breaks t (N + 1,), s, by their Bernstein coefficients (N, d + 1, n), which enclose
+    them.
+    """
+
+    t: Array
+    coefficients: Array
+
+    def derivative(self) -> PiecewisePolynomial:
+        """Return the time derivative of the piecewise polynomials."""
+        degree = self.coefficients.shape[1] - 1
+        width = np.diff(self.t)[:, None, None]
+        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
+
+    def at(self, times: Array) -> Array:
+        """Return the values (M, n) at times (M,), clipped to the range of `t`; at a break those of the later piece."""
+        interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
+        begin, end = self.t[interval], self.t[interval + 1]
+        return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
+
+    def within(self, interval: Indices, fraction: Array) -> Array:
+        """Return the values (M, n) in given intervals (M,) at fractions (M,), 0 to 1, of the interval length."""
+        degree = self.coefficients.shape[1] - 1
+        s = fraction[:, None]
+        terms = (
+            comb(degree, k) * s**k * (1 - s) ** (degree - k) * self.coefficients[interval, k] for k in range(degree + 1)
+        )
+        return np.asarray(sum(terms))
+
+    @property
+    def greatest(self) -> Array:
+        """Upper bounds of the absolute values of the polynomials in each interval. Shape (N, n)."""
+        return np.asarray(np.abs(self.coefficients).max(axis=1))
+
+
+def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
+    """Return maxima on [0, 1] of polynomials in Bernstein form (K, d + 1), and where they occur. Shape (K,) each."""
+    first, last, count = coefficients[:, 0], coefficients[:, -1], len(coefficients)
+    best, argument = np.maximum(first, last), (last > first).astype(float)
+    pieces = scipy.interpolate.BPoly(coefficients.T, np.arange(count + 1.0))
+    slopes = scipy.interpolate.PPoly.from_bernstein_basis(pieces.derivative())
+    stationary = slopes.roots(discontinuity=False, extrapolate=False)
+    stationary = stationary[np.isfinite(stationary)]
+    owner, values = np.minimum(stationary.astype(int), count - 1), pieces(stationary)
+    improved = np.flatnonzero(values > best[owner])
+    order = improved[np.argsort(values[improved])]  # of several maxima in one interval the greatest is assigned last
+    best[owner[order]], argument[owner[order]] = values[order], stationary[order] - owner[order]
+    return best, argument
+
+
+class MotionQuantity(NamedTuple):
+    """A quantity, such as the velocity, of every joint along a motion.
+
+    Attributes:
+        pieces: The quantity as polynomials, or the constants between two times that divided differences give.
+        blur: Largest error of the quantity due to the digits of the file. Shape (N, n).
+        closed: Whether it is that of the interpolant at every time, and not of any motion through the samples at some.
+        needed: See `Motion.needed`.
+    """
+
+    pieces: PiecewisePolynomial
+    blur: Array
+    closed: bool
+    needed: tuple[Any, Any] = (np.inf, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Samples of a joint motion at times (M,), s, and the rule of interpolation between them.
+
+    Velocities or accelerations (M, n) may be None. `stated` says that the controller is known to interpolate by this
+    rule, so that the interpolant itself counts.
+    """
+
+    t: Array
+    q: Array
+    v: Array | None = None
+    a: Array | None = None
+    stated: bool = False
+
+    @property
+    def rule(self) -> Rule:
+        """Name of the rule of interpolation between the samples: "linear", "cubic" or "quintic"."""
+        return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
+
+    def by(self, rule: Rule) -> Motion:
+        """Return the same samples with another rule; raise ProblemError if it needs values that they do not have."""
+        missing = "velocities" if self.v is None else "accelerations" if self.a is None and rule == "quintic" else None
+        if rule != "linear" and missing:
+            words = f"the rule {rule!r} needs {missing}, which are not given for every joint; omit the rule"
+            raise ProblemError(words, name="rule", value=rule)
+        v, a = None if rule == "linear" else self.v, self.a if rule == "quintic" else None
+        return Motion(self.t, self.q, v, a, stated=True)
+
+    @cached_property
+    def position(self) -> PiecewisePolynomial:
+        """Positions between the samples as piecewise polynomials of time."""
+        h = np.diff(self.t)[:, None]
+        q, v, a = self.q, self.v, self.a
+        if v is None:
+            inner: list[Array] = []
+        elif a is None:
+            inner = [q[:-1] + h / 3 * v[:-1], q[1:] - h / 3 * v[1:]]
+        else:
+            inner = [
+                q[:-1] + h / 5 * v[:-1],
+                q[:-1] + 2 * h / 5 * v[:-1] + h**2 / 20 * a[:-1],
+                q[1:] - 2 * h / 5 * v[1:] + h**2 / 20 * a[1:],
+                q[1:] - h / 5 * v[1:],
+            ]
+        return PiecewisePolynomial(self.t, np.stack([q[:-1], *inner, q[1:]], axis=1))
+
+    @cached_property
+    def velocity(self) -> PiecewisePolynomial:
+        """Velocities as piecewise polynomials of time; piecewise constant if the file has only positions."""
+        return self.position.derivative()
+
+    def end_speeds(self) -> Array:
+        """Return the speeds of the joints at both ends, 0 for a joint that is at rest there. Shape (2, n).
+
+        A motion of which only positions are known counts as at rest at an end if its mean speed in the interval there
+        is at most the change of speed to the next interval, as under any constant acceleration or jerk from rest.
+        """
+        rates = np.diff(self.q, axis=0) / np.diff(self.t)[:, None] if self.v is None else self.v
+        speeds, tolerated = np.abs(rates[[0, -1]]), LIMIT_SHARE * np.abs(rates).max(initial=0.0)
+        if self.v is None and len(rates) > 1:
+            tolerated = np.maximum(tolerated, np.abs(rates[[0, -1]] - rates[[1, -2]]))
+        return np.where(speeds > tolerated, speeds, 0.0)
+
+    @cached_property
+    def acceleration(self) -> PiecewisePolynomial | None:
+        """Accelerations as piecewise polynomials of time; None for linear interpolation."""
+        return None if self.v is None else self.velocity.derivative()
+
+    @cached_property
+    def digits(self) -> tuple[Array, Array, Array]:
+        """Rounding errors of positions, velocities and accelerations: half of their last digits. Shape (n,) each."""
+        none = np.zeros(self.q.shape[1])
+        return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
+
+    def quantity(self, name: str) -> MotionQuantity | None:
+        """Return a quantity along the motion, such as "velocity" or "jerk"; None if there are too few samples."""
+        h = np.diff(self.t)[:, None]
+        eq, ev, ea = self.digits
+        smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
+        if name == "position":
+            return MotionQuantity(self.position, np.broadcast_to(eq, h.shape[:1] + eq.shape), True)
+        if name == "velocity":
+            # only the middle Bernstein coefficient contains the difference of positions
+            blur = {0: 2 * eq / h, 1: 3 * eq / h + ev, 2: 3.75 * eq / h + 2.5 * ev + 0.2 * h * ea}[smooth]
+            return MotionQuantity(self.velocity, blur, True, self.needed(name))
+        if name == "acceleration" and smooth:
+            assert self.acceleration is not None
+            blur = 12 * eq / h**2 + 6 * ev / h if smooth == 1 else 30 * eq / h**2 + 15 * ev / h + 3 * ea
+            return MotionQuantity(self.acceleration, blur, True, self.needed(name))
+        if name == "jerk" and smooth == 2:
+            assert self.acceleration is not None
+            blur = 120 * eq / h**3 + 60 * ev / h**2 + 12 * ea / h
+            return MotionQuantity(self.acceleration.derivative(), blur, True, self.needed(name))
+        values, digits, order = (self.q, eq, 2 if name == "acceleration" else 3) if smooth == 0 else (self.v, ev, 2)
+        assert values is not None
+        return self._differences(values, digits, order)
+
+    def needed(self, name: str) -> tuple[Any, Any]:
+        """Return the least maxima of a quantity and its negative in each interval, of all motions through the samples.
+
+        Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
+        where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
+        times the mean of both velocities. Given accelerations count as well. Jerk: three weighted means, with weights 1
+        and the Chebyshev polynomials U1 and U2 of the interval; from rest to rest this gives 32 of the 60 that a
+        quintic has. Velocity: the peak of a trapezoidal profile, the lowest of all motions that accelerate no harder
+        than this interval or its neighbours need; without that bound only the mean velocity would be certain.
+        """
+        if self.stated or self.v is None:
+            return np.inf, np.inf
+        h, v, a = np.diff(self.t)[:, None], self.v, self.a
+        displacement, change, mean = np.diff(self.q, axis=0), np.diff(v, axis=0), (v[1:] + v[:-1]) / 2
+        residual = displacement - h * mean
+        if name == "jerk" and a is not None:
+            step = np.diff(a, axis=0)
+            means = (step * h**2, 4 * h * (change - h * (a[1:] + a[:-1]) / 2), 32 * residual + 3 * h**2 * step)
+            jerk = np.abs(means).max(axis=0) / h**3
+            return jerk, jerk
+        least = (2 * np.abs(residual) + np.sqrt(4 * residual**2 + (h * change) ** 2)) / h**2
+        if a is not None:
+            least = np.maximum(least, np.maximum(np.abs(a[1:]), np.abs(a[:-1])))
+        if name == "acceleration":
+            return least, least
+        padded = np.pad(least, ((1, 1), (0, 0)))
+        hardest = np.maximum(least, np.maximum(padded[2:], padded[:-2]))
+        ends = (v[1:] ** 2 + v[:-1] ** 2) / 2
+
+        def peak(sign: float) -> Array:
+            middle = hardest * h / 2 + sign * mean
+            lowest = middle - np.sqrt(np.maximum(middle**2 - sign * hardest * displacement - ends, 0.0))
+            return np.asarray(np.maximum(lowest, np.maximum(sign * v[1:], sign * v[:-1])))
+
+        return peak(1.0), peak(-1.0)
+
+    def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
+        """Return a time derivative of sampled values by divided differences; None if the samples are too few."""
+        if len(self.t) <= order:
+            return None
+        table, blur = values, np.broadcast_to(digits, values.shape)
+        for k in range(1, order + 1):
+            width = (self.t[k:] - self.t[:-k])[:, None]
+            table, blur = k * np.diff(table, axis=0) / width, k * (blur[1:] + blur[:-1]) / width
+        begin, end = self.t[:-order], self.t[order:]
+        middle = (begin + end) / 2
+        edges = np.concatenate([[begin[0]], (middle[1:] + middle[:-1]) / 2, [end[-1]]])
+        return MotionQuantity(PiecewisePolynomial(edges, table[:, None]), blur, False)
+
+
+def interpolate(times: Array, t: Array, values: Array) -> Array:
+    """Interpolate `values` (M, n), given at increasing times `t` (M,), linearly at other times (K,). Shape (K, n)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
+
+
+def half_digits(values: Array) -> Array:
+    """Return the rounding error of each column of numbers: half of its last decimal or binary digit. Shape (n,).
+
+    Columns with digits coarser than a thousandth or with few values count as exact.
+    """
+    errors = np.asarray(2.0**-53 * np.abs(values).max(axis=0))
+    for k, column in enumerate(values.T):
+        distinct = np.unique(column)
+        if len(distinct) < 20:
+            continue
+        for power in range(3, 13):
+            scaled = distinct * 10.0**power
+            if (np.abs(scaled - np.rint(scaled)) <= 1e-14 * np.abs(scaled) + 1e-9).all():
+                errors[k] = 0.5 * 10.0**-power
+                break
+        else:
+            if (distinct.astype(np.float32) == distinct).all():
+                errors[k] = 2.0**-25 * np.abs(distinct).max()
+    return errors
+
+
+# ---- limits -------------------------------------------------------------------------------------------------------
+
+
 def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
     """Combine limits given by joint name with the limits of the robot for all other joints.
 
-    Args:
-        robot: The robot.
-        limits: For "velocity", "acceleration", "jerk" or "torque" the limits by name of the joint; "" stands for all
-            joints that are not named.
+    `limits` has for "velocity", "acceleration", "jerk" or "torque" the limits by name of the joint; "" stands for all
+    joints that are not named.
 
     Raises:
         ProblemError: A joint is unknown, or a limit is not a number above 0.
@@ -124,12 +383,7 @@ def limit_rows(
 ) -> tuple[list[Row], list[Fault], list[str]]:
     """Check a motion against all joint limits; return table rows, faults, and the quantities that could not be checked.
 
-    Args:
-        motion: Motion of the joints.
-        robot: The robot.
-        joints: Indices of the motion's joints in the joint vector.
-        bounds: Limits of the joint vector.
-        share: Tolerance relative to a limit.
+    `joints` are the indices of the motion's joints in the joint vector; `share` is the tolerance relative to a limit.
     """
     rows: list[Row] = []
     faults: list[Fault] = []
@@ -141,11 +395,11 @@ def limit_rows(
                 unchecked.append(f"{order}, because there are too few samples")
             continue
         most = None if order == "position" else getattr(bounds, order)
+        lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
         for column, joint in enumerate(joints):
-            name = robot.joint_names[joint]
+            name, low, high = robot.joint_names[joint], float(lower[joint]), float(upper[joint])
             unit = robot.joint(name).unit + per
-            low, high = (bounds.lower[joint], bounds.upper[joint]) if most is None else (-most[joint], most[joint])
-            row, fault = _check_limits(quantity, column, order, name, unit, float(low), float(high), share)
+            row, fault = _check_limits(quantity, column, order, name, unit, low, high, share)
             rows.append(row)
             faults += fault
     return rows, faults, unchecked
@@ -165,14 +419,8 @@ def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
 class _Side(NamedTuple):
     """Largest values of one quantity of a joint towards its upper or lower limit, in each interval between samples.
 
-    Values and limit are multiplied by `sign`.
-
-    Attributes:
-        sign: 1 for the upper limit, -1 for the lower.
-        limit: The limit.
-        values: Maxima, at most the values that every motion through the samples needs. Shape (N,).
-        time: Time of the largest value, s.
-        eased: Whether the interpolant violates the limit although not every motion through the samples needs to.
+    Values (N,) and limit are multiplied by `sign`: 1 for the upper limit, -1 for the lower. They are at most what every
+    motion through the samples needs; `eased` says that the interpolant violates the limit, but not every such motion.
     """
 
     sign: float
@@ -181,33 +429,28 @@ class _Side(NamedTuple):
     time: float
     eased: bool
 
-    @classmethod
-    def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
-        """Return the largest values of a quantity of one joint towards its upper (sign 1) or lower limit (-1)."""
-        coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
-        needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
-        ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
-        # refine the intervals whose enclosure exceeds the largest end value or the limit
-        above = np.minimum(enclosed, needed) > np.minimum(ends, needed).max()
-        refined = np.flatnonzero(above | ((enclosed > limit) & (ends <= limit)))
-        values, fractions = ends.copy(), (coefficients[:, -1] > coefficients[:, 0]).astype(float)
-        if refined.size and coefficients.shape[1] > 2:
-            values[refined], fractions[refined] = polynomial_maxima(coefficients[refined])
-        eased = bool((values > np.maximum(needed, limit + tolerance)).any())
-        values = np.minimum(values, needed)
-        k = int(values.argmax())
-        share = fractions[k] if coefficients.shape[1] > 1 else 0.5
-        return cls(sign, limit, values, float(t[k] + share * (t[k + 1] - t[k])), eased)
-
-    @property
-    def excess(self) -> float:
-        """Difference between the largest value and the limit; -inf if there is no limit."""
-        return float(self.values.max() - self.limit)
-
     @property
     def worst_value(self) -> float:
-        """Largest value towards the limit with its original sign, that is, not multiplied by `sign`."""
+        """Largest value towards the limit with its original sign."""
         return self.sign * float(self.values.max())
+
+
+def _side(quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
+    """Return the largest values of a quantity of one joint towards its upper (sign 1) or lower limit (-1)."""
+    coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
+    needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
+    ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
+    # refine the intervals whose enclosure exceeds the largest end value or the limit
+    above = np.minimum(enclosed, needed) > np.minimum(ends, needed).max()
+    refined = np.flatnonzero(above | ((enclosed > limit) & (ends <= limit)))
+    values, fractions = ends.copy(), (coefficients[:, -1] > coefficients[:, 0]).astype(float)
+    if refined.size and coefficients.shape[1] > 2:
+        values[refined], fractions[refined] = polynomial_maxima(coefficients[refined])
+    eased = bool((values > np.maximum(needed, limit + tolerance)).any())
+    values = np.minimum(values, needed)
+    k = int(values.argmax())
+    share = fractions[k] if coefficients.shape[1] > 1 else 0.5
+    return _Side(sign, limit, values, float(t[k] + share * (t[k + 1] - t[k])), eased)
 
 
 def _check_limits(
@@ -217,25 +460,20 @@ def _check_limits(
     note = "" if quantity.closed else "of any motion through the samples, by divided differences"
     t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
     tolerance = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
-    sides = [_Side.of(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
+    sides = [_side(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
     if not np.isfinite([low, high]).any():
         worst = max(sides, key=lambda side: float(side.values.max()))
         return Row(f"{order} of {name}", worst.worst_value, None, unit, worst.time, RowVerdict.UNLIMITED, note), []
-    sides.sort(key=lambda side: side.excess, reverse=True)
-    worst = sides[0]
-    beyond = np.any([side.values > side.limit + tolerance for side in sides], axis=0)
-    certain = [side.values > side.limit + tolerance + blur for side in sides]
+    sides.sort(key=lambda side: float(side.values.max()) - side.limit, reverse=True)
+    beyond, certain = ([side.values > side.limit + tolerance + error for side in sides] for error in (0.0, blur))
     violated = certain[0] | certain[1]
-    verdict = RowVerdict.FAILED if violated.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
-    if verdict is RowVerdict.FAILED and not certain[0].any():
-        worst = sides[1]
+    verdict = RowVerdict.of(violated.any(), np.any(beyond))
+    worst = sides[1] if violated.any() and not certain[0].any() else sides[0]
     value, allowed, time = worst.worst_value, worst.sign * worst.limit, worst.time
-    remark = ""
     if verdict is RowVerdict.OK and any(side.eased for side in sides):
-        remark = "the interpolant is beyond, but not every motion through the samples"
-    elif verdict is RowVerdict.OK and worst.excess > 0:
-        remark = f"beyond, by less than the {100 * share:g} % allowed"
-    note = "; ".join(filter(None, (remark, note)))
+        note = "; ".join(filter(None, ("the interpolant is beyond, but not every motion through the samples", note)))
+    elif verdict is RowVerdict.OK and worst.values.max() > worst.limit:
+        note = "; ".join(filter(None, (f"beyond, by less than the {100 * share:g} % allowed", note)))
     row = Row(f"{order} of {name}", value, allowed, unit, time, verdict, note)
     if verdict is not RowVerdict.FAILED:
         return row, []
@@ -247,232 +485,3 @@ def _check_limits(
     much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
     text = f"{value:.5g} {unit} at {time:.6g} s{between}, limit {allowed:.5g}{much}{stretches}"
     return row, [Fault(order, name, text, time, first, value, allowed, unit)]
-
-
-def effort_rows(
-    cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check torques that the file gives at the samples against the torque limits; return table rows and faults."""
-    rows: list[Row] = []
-    faults: list[Fault] = []
-    if cleaned.efforts is None:
-        return rows, faults
-    for column, joint in enumerate(cleaned.joints):
-        name = robot.joint_names[joint]
-        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[joint])
-        k = int(np.abs(cleaned.efforts[:, column]).argmax())
-        value, time = float(cleaned.efforts[k, column]), float(cleaned.motion.t[k])
-        failed = abs(value) > limit * (1 + share)
-        verdict = RowVerdict.FAILED if failed else RowVerdict.OK if np.isfinite(limit) else RowVerdict.UNLIMITED
-        row_limit = limit if np.isfinite(limit) else None
-        rows.append(Row(f"given torque of {name}", value, row_limit, unit, time, verdict, "as given in the file"))
-        if failed:
-            text = f"the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
-            faults.append(Fault("torque", name, text, time, time, value, limit, unit))
-    return rows, faults
-
-
-def torque_rows(
-    motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
-) -> tuple[list[Row], list[Fault]]:
-    """Check joint torques from inverse dynamics at five times of every interval; return table rows and faults.
-
-    With linear interpolation they are evaluated at the samples, with velocities and accelerations by differences. A
-    floating base moves as the joints drive it, from rest, without gravity.
-    """
-    robot = machine.robot
-    n = robot.dof
-    q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
-    torque = torque_expression(machine, q, v, a)
-    sampler = Sampler([q, v, a], [torque])
-    times, *values = torque_samples(motion)
-    if not len(times):
-        return [], []
-    check_time()
-    torques = sampler(*values)[0]
-    mean = motion.q.mean(axis=0)
-    # torques are linear in accelerations
-    sensitivity = np.abs(np.array(ca.Function("inertia", [q], [ca.jacobian(torque, a)])(mean)))
-    acceleration = motion.quantity("acceleration")
-    blur = sensitivity @ (np.zeros(n) if acceleration is None else np.median(np.asarray(acceleration.blur), axis=0))
-    rows, faults = [], []
-    note = "at samples, by differences" if motion.rule == "linear" else "at five times of every interval"
-    for k, name in enumerate(robot.joint_names):
-        unit, limit = robot.joint(name).effort_unit, float(bounds.torque[k])
-        at = int(np.abs(torques[:, k]).argmax())
-        value, time = float(torques[at, k]), float(times[at])
-        verdict = RowVerdict.UNLIMITED
-        if np.isfinite(limit):
-            beyond = np.abs(torques[:, k]) > limit * (1 + share)
-            certain = beyond & (np.abs(torques[:, k]) > limit * (1 + share) + blur[k])
-            verdict = RowVerdict.FAILED if certain.any() else RowVerdict.UNDECIDED if beyond.any() else RowVerdict.OK
-            if certain.any():
-                first = float(times[np.flatnonzero(certain)[0]])
-                text = f"{value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
-                faults.append(Fault("torque", name, text, time, first, value, limit, unit))
-        rows.append(Row(f"torque of {name}", value, limit if np.isfinite(limit) else None, unit, time, verdict, note))
-    return rows, faults
-
-
-def torque_expression(machine: Machine, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
-    """Return the joint torques of a machine without external forces as functions of its joint motion. Shape (n, 1).
-
-    A floating base moves so that momentum is conserved.
-
-    Args:
-        machine: The machine.
-        q, v, a: Symbols of the joint positions, velocities and accelerations. Shape (n, 1) each.
-    """
-    if not isinstance(machine, FreeFloating):
-        gravity = getattr(machine, "gravity_in_world", GRAVITY)
-        frame = machine.world_from_base(())
-        return inverse_dynamics(simplify(machine.robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
-    base = ca.SX.sym("base", machine.base_size)
-    rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
-    twist = ca.mtimes(rows, machine.base_twist(base, q, v))
-    rate = machine.base_rate(base, q, v)
-    change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
-    frame = machine.world_from_base(base)
-    torque = inverse_dynamics(
-        machine.robot, q, v, a, gravity=(0.0, 0.0, 0.0), world_from_base=frame, base_motion=(twist, change)
-    )
-    return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
-
-
-def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
-    """Return times (K,), s, and positions, velocities and accelerations (K, n) of a motion for inverse dynamics."""
-    t, h = motion.t, np.diff(motion.t)
-    if motion.acceleration is None:
-        if len(t) < 3:
-            return t[:0], motion.q[:0], motion.q[:0], motion.q[:0]
-        slope = np.diff(motion.q, axis=0) / h[:, None]
-        left, right = h[:-1, None], h[1:, None]
-        v = (slope[:-1] * right + slope[1:] * left) / (left + right)
-        return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
-    fractions = np.linspace(0.0, 1.0, 5)
-    interval = np.repeat(np.arange(len(h)), len(fractions))
-    fraction = np.tile(fractions, len(h))
-    q, v, a = (one.within(interval, fraction) for one in (motion.position, motion.velocity, motion.acceleration))
-    needed = np.broadcast_to(motion.needed("acceleration")[0], (len(h), a.shape[1]))[interval]
-    return t[interval] + fraction * h[interval], q, v, np.clip(a, -needed, needed)
-
-
-def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
-    """Check ground force, zero moment point and friction of a standing machine; return table rows and faults."""
-    n = machine.joint_size
-    q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
-    reaction = machine.ground_reaction(q, v, a)
-    point = center_of_pressure(reaction)
-    slip = ca.norm_2(reaction[3:5])
-    sampler = Sampler([q, v, a], [machine.support.margin(point), reaction[5], slip, point])
-    times, *values = torque_samples(motion)
-    if not len(times):
-        return [], []
-    margin, push, slide, place = sampler(*values)
-    margin, push = margin[:, 0], push[:, 0]
-    note = "at samples, by differences" if motion.rule == "linear" else "at five times of every interval"
-    rows, faults = [], []
-
-    def check(quantity: str, value: Array, least: float, unit: str, words: str) -> None:
-        k = int(value.argmin())
-        failed = not value[k] >= least
-        time = float(times[k])
-        rows.append(Row(quantity, float(value[k]), least, unit, time, RowVerdict.of(failed), note))
-        if failed:
-            first = float(times[np.flatnonzero(~(value >= least))[0]])
-            text = f"{words} at {time:.6g} s, first at {first:.6g} s"
-            faults.append(Fault(quantity, machine.robot.root, text, time, first, float(value[k]), least, unit))
-
-    down = int(push.argmin())
-    check("vertical force of the ground", push, 0.0, "N", f"the ground would have to pull with {-push[down]:.4g} N")
-    out = int(margin.argmin())
-    at = f"({place[out, 0]:.4g}, {place[out, 1]:.4g}) m"
-    check("zero moment point", margin, 0.0, "m", f"it is {-margin[out]:.4g} m outside the foot, at {at},")
-    if np.isfinite(friction):
-        spare = friction * push - slide[:, 0]
-        k = int(spare.argmin())
-        check(
-            "friction", spare, 0.0, "N", f"the foot slips: {slide[k, 0]:.4g} N along the ground, {push[k]:.4g} N on it,"
-        )
-    return rows, faults
-
-
-def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Return the configurations (M, base_size) of a floating base at the samples of a joint motion, and table rows.
-
-    The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
-    in every interval.
-    """
-    n, size = machine.joint_size, machine.base_size
-    base, h = ca.SX.sym("base", size), ca.SX.sym("h")
-    q, v = ca.SX.sym("q", n, 3), ca.SX.sym("v", n, 3)
-
-    def rate(place: float, value: ca.SX) -> ca.SX:
-        return machine.base_rate(value, q[:, int(2 * place)], v[:, int(2 * place)])
-
-    next_base = rk4_step(rate, base, h)
-    if size == 7:
-        next_base = ca.vertcat(next_base[:3], next_base[3:] / ca.norm_2(next_base[3:]))
-    count = len(motion.t) - 1
-    interval = np.arange(count)
-    values = [
-        [one.within(interval, np.full(count, position)) for position in (0.0, 0.5, 1.0)]
-        for one in (motion.position, motion.velocity)
-    ]
-    stacked = [np.stack(each, axis=1).reshape(count * 3, n).T for each in values]
-    step = ca.Function("step", [base, q, v, h], [next_base], {"cse": True})
-    steps = step.mapaccum(count)(machine.base_home(), *stacked, np.diff(motion.t)[None])
-    bases = np.vstack([machine.base_home(), np.array(steps).T])
-    position = bases[:, :2] if size == 3 else bases[:, :3]
-    distance = np.linalg.norm(position - position[0], axis=1)
-    turns = np.abs(bases[:, 2] - bases[0, 2]) if size == 3 else 2 * np.arccos(np.clip(np.abs(bases[:, 3]), 0.0, 1.0))
-    k, j = int(distance.argmax()), int(turns.argmax())
-    note = "integrated so that momentum is conserved"
-    rows = [
-        Row("displacement of the base", float(distance[k]), None, "m", float(motion.t[k]), RowVerdict.INFO, note),
-        Row("rotation of the base", float(turns[j]), None, "rad", float(motion.t[j]), RowVerdict.INFO, note),
-    ]
-    return bases, rows
-
-
-def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check that the total momentum is constant under the given base motion; return table rows and faults.
-
-    The velocity of the base is computed by central differences.
-    """
-    if len(motion.t) < 3:
-        return [], []
-    robot, size = machine.robot, machine.base_size
-    q, v = ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
-    base, rate = ca.SX.sym("base", size), ca.SX.sym("rate", size)
-    frame = machine.world_from_base(base)
-    if size == 3:
-        spin, speed = ca.vertcat(0, 0, rate[2]), ca.vertcat(rate[0], rate[1], 0)
-    else:
-        turn = rotation_from_quaternion(base[3:7])
-        by_rate = ca.reshape(ca.jtimes(ca.vec(turn), base, ca.vertcat(ca.SX(3, 1), rate[3:7])), 3, 3)
-        skew = ca.mtimes(by_rate, turn.T)
-        spin, speed = ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]), rate[:3]
-    twist = ca.vertcat(spin, speed - cross(spin, frame.position))
-    joints = momentum(robot, q, v, world_from_base=frame)
-    total = joints + ca.mtimes(robot_inertia(robot, q, frame), twist)
-    middle = slice(1, -1)
-    width = (motion.t[2:] - motion.t[:-2])[:, None]
-    rates = (bases[2:] - bases[:-2]) / width
-    speeds = motion.v[middle] if motion.v is not None else (motion.q[2:] - motion.q[:-2]) / width
-    whole, carried = Sampler([q, v, base, rate], [total, joints])(motion.q[middle], speeds, bases[middle], rates)
-    rows, faults = [], []
-    for quantity, part, unit in (("moment of momentum", slice(0, 3), "N m s"), ("momentum", slice(3, 6), "N s")):
-        change = np.linalg.norm(whole[:, part] - np.median(whole[:, part], axis=0), axis=1)
-        size_ = float(np.linalg.norm(carried[:, part], axis=1).max())
-        limit = MOMENTUM_SHARE * size_ + ROUNDING_SHARE
-        k = int(change.argmax())
-        value, time = float(change[k]), float(motion.t[k + 1])
-        failed = value > limit
-        rows.append(Row(f"change of {quantity}", value, limit, unit, time, RowVerdict.of(failed), "base as given"))
-        if failed:
-            first = float(motion.t[1:-1][np.flatnonzero(change > limit)[0]])
-            sentence = f"{quantity} changes by {value:.4g} {unit} at {time:.6g} s"
-            text = f"{sentence}; that of the joints is {size_:.4g}: the given motion of the base is inconsistent"
-            faults.append(Fault("momentum", robot.root, text, time, first, value, limit, unit))
-    return rows, faults

@@ -12,20 +12,19 @@ import numpy as np
 from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing
 from models.checks import Array, real
 from models.shapes.mesh_files import find_mesh
-from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
-from ocp.app.check.interpolation import Rule
-from ocp.app.check.joint_limits import (
-    Row,
-    RowVerdict,
-    effort_rows,
+from ocp.app.check.data_checks import CleanedTrajectory, clean_trajectory, doubtful_times, exchanged_joints
+from ocp.app.check.joint_limits import Fault, Row, RowVerdict, Rule, limit_rows, rest_row
+from ocp.app.check.motion_checks import (
+    Findings,
+    check_clearance,
+    check_efforts,
+    check_ground,
+    check_momentum,
+    check_path,
+    check_torques,
     integrate_base,
-    limit_rows,
-    momentum_rows,
-    rest_row,
-    standing_rows,
-    torque_rows,
+    with_wide_limits,
 )
-from ocp.app.check.kinematic_checks import clearance_rows, doubtful_times, exchanged_joints, path_rows, with_wide_limits
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
 from ocp.audit.audit import Audit
@@ -221,12 +220,10 @@ def check_trajectory(
 ) -> Check:
     """Check a joint trajectory of a machine against limits, for collisions, and against the required path of the tip.
 
-    Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
-    accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
-    the tip are evaluated several times between two samples.
-
-    A floating base starts at rest. On a standing machine the ground may not pull, the zero moment point stays in the
-    foot, and the foot does not slip.
+    Between samples the motion is interpolated as controllers do. Positions, velocities, accelerations and jerks are
+    bounded there at all times, and clearance is proven. Torques, the zero moment point and the tip are evaluated
+    several times between two samples. A floating base starts at rest. On a standing machine the ground may not pull,
+    the zero moment point stays in the foot, and the foot does not slip.
 
     Args:
         machine: The machine, or a robot whose base is fixed at the world's origin.
@@ -262,51 +259,43 @@ def check_trajectory(
     if interpretation.rule is not None:
         cleaned = replace(cleaned, motion=cleaned.motion.by(interpretation.rule))
     motion, complete = cleaned.motion, len(cleaned.joints) == robot.dof
-    rows: list[Row] = []
-    faults, unchecked = list(cleaned.faults), []
-
-    def add(result: tuple[list[Row], list[Fault]]) -> None:
-        rows.extend(result[0])
-        faults.extend(result[1])
-        check_time()
-
+    findings, share = Findings(faults=list(cleaned.faults)), tolerances.share
     progress("limits")
-    limit_table, limit_faults, unlimited_orders = limit_rows(
-        motion, robot, cleaned.joints, bounds, share=tolerances.share
-    )
-    add(([*limit_table, rest_row(motion, robot, cleaned.joints)], limit_faults))
-    unchecked += unlimited_orders
-    add(effort_rows(cleaned, robot, bounds, tolerances.share))
+    rows, faults, unchecked = limit_rows(motion, robot, cleaned.joints, bounds, share=share)
+    findings.rows += [*rows, rest_row(motion, robot, cleaned.joints)]
+    findings.faults += faults
+    check_efforts(findings, cleaned, robot, bounds, share=share)
+    check_time()
     if not complete:
         unchecked.append("torques, clearance and the tip, because joints are missing")
     else:
         bases = None
         if isinstance(machine, FreeFloating):
             progress("momentum")
-            if cleaned.base is not None and cleaned.base.shape[1] != machine.base_size:
-                words = (
-                    f"the file gives {cleaned.base.shape[1]} entries of the base, the machine has {machine.base_size}"
-                )
-                raise ProblemError(words, name="base", value=cleaned.base.shape[1], limit=machine.base_size)
             if cleaned.base is None:
                 bases, base_rows = integrate_base(machine, motion)
-                rows += base_rows
+                findings.rows += base_rows
+            elif (count := cleaned.base.shape[1]) != machine.base_size:
+                words = f"the file gives {count} entries of the base, the machine has {machine.base_size}"
+                raise ProblemError(words, name="base", value=count, limit=machine.base_size)
             else:
                 bases = cleaned.base
-                add(momentum_rows(machine, motion, bases))
+                check_momentum(findings, machine, motion, bases)
         elif isinstance(machine, Standing):
             progress("ground")
-            add(standing_rows(machine, motion, limits.friction))
+            check_ground(findings, machine, motion, limits.friction)
         if robot.total_mass == 0:
             unchecked.append("torques, because the robot has no masses")
         else:
             progress("torques")
-            add(torque_rows(motion, machine, bounds, tolerances.share))
+            check_torques(findings, machine, motion, bounds, share=share)
+        check_time()
         if path is not None:
             progress("path")
             default = default_tolerance(path.positions)
             tolerance = default if tolerances.tip_distance is None else tolerances.tip_distance
-            add(path_rows(machine, motion, bases, path, tolerance=tolerance, angle=tolerances.tip_angle))
+            check_path(findings, machine, motion, bases, path=path, tolerance=tolerance, angle=tolerances.tip_angle)
+            check_time()
         progress("clearance")
         if scene is False:
             unchecked.append("clearance, as requested")
@@ -316,14 +305,14 @@ def check_trajectory(
             place: Scene = require.instance("scene", Scene() if scene is None else scene, Scene)
             unchecked += _missing_meshes(robot, place.folders) if place.missing == "skip" else []
             collisions = CollisionScene(with_wide_limits(machine, motion), **place.collision_options)
-            add(clearance_rows(collisions, motion, bases if collisions.obstacles else None))
+            check_clearance(findings, collisions, motion, bases if collisions.obstacles else None)
     suspicions: list[Fault] = []
-    if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in faults):
+    if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in findings.faults):
         suspicions += doubtful_times(motion, bounds.velocity[cleaned.joints])
     if not interpretation.names_confirmed:
         is_fixed = complete and not isinstance(machine, FreeFloating)
         suspicions += exchanged_joints(motion, robot, cleaned.joints, is_fixed)
-    faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
+    findings.faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
     return Check(
         trajectory.file,
         robot.name,
@@ -331,10 +320,10 @@ def check_trajectory(
         cleaned.samples,
         float(motion.t[-1] - motion.t[0]),
         motion.rule,
-        tuple(rows),
-        tuple(faults),
+        tuple(findings.rows),
+        tuple(findings.faults),
         tuple(suspicions),
-        _unlimited_quantities(rows),
+        _unlimited_quantities(findings.rows),
         tuple(unchecked),
         (*cleaned.notes, *notes),
         cleaned,
@@ -374,12 +363,9 @@ def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PlanVerdict:
-    """Audit of a plan, and check of the plan's samples against the limits of the machine.
+    """Audit of a plan against its problem, and check of the plan's samples against the limits of the machine.
 
-    Attributes:
-        audit: Audit of the plan against its problem.
-        check: Check of the plan's samples against the machine's limits of joints, velocities and torques.
-        margin: What the plan withstands, as a sentence with the plan as its subject; "" for a plan that fails.
+    `margin` says what the plan withstands, with the plan as its subject; "" for a plan that fails.
     """
 
     audit: Audit
@@ -402,13 +388,8 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Audit a plan, check samples of the plan against the limits of the machine, and evaluate its margin.
-
-    Args:
-        plan: The plan.
-        sample: Samples of the plan at the times at which the limits of the machine are checked.
-        name: Name of the plan.
-        settings: Settings of the audit.
+    """Audit a plan, check samples of it against the limits of the machine, and evaluate its margin; `settings` are
+    those of the audit.
     """
     verdict = PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
     return replace(verdict, margin=plan.margin().sentence) if verdict.passed else verdict
@@ -439,9 +420,8 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check sampled joint positions, rates and accelerations against a robot's limits; the last two may be None.
-
-    `values` has the times (M,), positions, rates and accelerations (M, n).
+    """Check times (M,), sampled joint positions, rates and accelerations (M, n) against a robot's limits; the last two
+    may be None.
     """
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem

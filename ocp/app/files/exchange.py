@@ -1,11 +1,8 @@
 """Write joint motions for other systems and read them back: MCAP logs, Rerun, programs of industrial robots.
 
-MCAP is the log format of ROS 2 and Foxglove. Its messages are those of ROS 2, written and read by the package
-`mcap-ros2-support` of the extra `mcap`. They are decoded with the definitions below, never with those of the file. The
-caller passes the module `rerun`; nothing here depends on it.
-
-Programs of industrial robots are URScript (Universal Robots), KRL (KUKA) and RAPID (ABB), see `write_robot_program`.
-Comments in them state which joint each axis moves. `ocp.app.files.trajectory` reads exactly these statements.
+MCAP is the log format of ROS 2 and Foxglove. Its messages are decoded with the definitions below, never with those of
+the file. Programs of industrial robots are URScript (Universal Robots), KRL (KUKA) and RAPID (ABB); comments in them
+state which joint each axis moves. `ocp.app.files.trajectory` reads exactly these statements.
 """
 
 from __future__ import annotations
@@ -119,11 +116,8 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
     """Read joint states or trajectories from a log; return their topic, and time stamp (ns) and fields of each message.
 
-    A stamp is that of the message's header, or the log time if that is zero.
-
-    Args:
-        file: Log as written by ROS 2, in CDR.
-        topic: Name of the topic; None: the only one of these kinds, or `/joint_states`.
+    A stamp is that of the message's header, or the log time if that is zero. Without a topic, it is the only one of
+    these kinds, or `/joint_states`.
 
     Raises:
         ProblemError: The file is missing or no valid log, the topic is unknown, or mcap-ros2-support is not installed.
@@ -160,25 +154,18 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
         raise ProblemError(f"{file}: cannot be read: {error.strerror}", name="file", value=str(file)) from error
     except Exception as error:  # mcap, zstandard and lz4 raise many kinds for broken bytes
         raise ProblemError(f"{file} is not a valid log: {error}", name="file", value=str(file)) from error
-    selected = topic
-    if topic is None and len(messages) == 1:
-        selected = next(iter(messages))
-    elif topic is None and "/joint_states" in messages:
-        selected = "/joint_states"
+    selected = topic or (next(iter(messages)) if len(messages) == 1 else "/joint_states")
     if selected not in messages:
         known = ", ".join(sorted(messages)) or "none"
         words = f"{file}: no topic {topic!r} of joint states or joint trajectories; available: {known}; name the topic"
         raise ProblemError(words, name="topic", value=topic, limit=tuple(messages))
-    return selected, [
-        (stamp, fields) for _, stamp, fields in sorted(messages[selected], key=lambda message: message[0])
-    ]
+    ordered = sorted(messages[selected], key=lambda message: message[0])
+    return selected, [(stamp, fields) for _, stamp, fields in ordered]
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of an MCAP log in file order, including the records inside chunks.
-
-    Raises:
-        ValueError: A record, or the unpacked log, is too large.
+    """Yield the records of an MCAP log in file order, also inside chunks; raise ValueError if a record, or the log, is
+    too large.
     """
     from mcap.exceptions import EndOfFile
     from mcap.records import Chunk
@@ -279,14 +266,11 @@ class RobotLanguage(NamedTuple):
     """Grammar of the programs for the controllers of one maker, as far as selfmotion writes them.
 
     Attributes:
-        title: Name of the language.
-        comment: Sign that begins a comment.
+        title, comment: Name of the language, and sign that begins a comment.
         arm, external: Names of the axes of the robot, and of the external axes.
-        unit: Unit of revolute joints, a key of PROGRAM_UNITS; prismatic joints are in mm.
-        decimals: Number of decimals of joint positions.
+        unit, decimals: Unit of revolute joints, a key of PROGRAM_UNITS (prismatic joints are in mm), and decimals.
         statements: Patterns of the statements in their order, without spaces beside signs. Groups are the positions of
-            the axes, and `time` the duration of a step in s.
-        repeated: Index of the statement that may occur any number of times.
+            the axes, and `time` the duration of a step in s. Statement number `repeated` may occur any number of times.
     """
 
     title: str

@@ -38,7 +38,7 @@ from ocp.app.files.gcode_words import (
 )
 from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, checked_reversal
 from ocp.app.files.safe_files import FileName, line_error, read_lines
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 
 UNITS = {"mm": 1e-3, "inch": 0.0254}
 DEFAULT_GAPS_M = {"mm": 2 * np.sqrt(2) * 1e-5, "inch": 2 * np.sqrt(2) * 2.54e-5}
@@ -84,11 +84,9 @@ def read_gcode(
     """
     if unit is not None:
         require.choice("G-code: unit", unit, tuple(UNITS))
-    try:
+    with problem_errors():
         origin = require.array("G-code: start", start, (3,))
         home_position = None if home is None else require.array("G-code: home", home, (3,))
-    except ModelError as error:
-        raise ProblemError(str(error), **vars(error)) from error
     reader = _Reader(
         file,
         unit,
@@ -277,20 +275,18 @@ class _Reader:
                 self._refuse("G53 is supported with G0 only")
             if any(words[AXES[i]] for i in axes):
                 self._refuse("G53 moves in the machine's own coordinates; write the position in the program's")
+        via = self._target(words)
+        for axis in AXES:
+            words.pop(axis, None)
         if self.home is None:
-            for axis in AXES:
-                words.pop(axis, None)
             if has_moved:
                 self.machine = self.block
             self._note(f"{code_name(code)}: the machine's own position; ignored")
             return
-        if code != 530:  # via the programmed point
-            self._rapid(self._target(words))
+        if code != 530:
+            self._rapid(via)
         target = self.position.copy()
-        for i in axes or range(3):
-            target[i] = self.home[i]
-        for axis in AXES:
-            words.pop(axis, None)
+        target[axes or slice(None)] = self.home[axes or slice(None)]
         self._rapid(target)
 
     def _shift(self, codes: set[int], words: dict[str, float]) -> None:

@@ -1,13 +1,10 @@
 """Split G-code lines into words, classify the codes, and construct arcs from their centre or radius.
 
-The dialect is RS274/NGC as in the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes": letters of either case,
-blanks anywhere, `( )` and `;` comments, block delete `/`, line numbers N, files between two lines of `%`. A program
-number `O1000` alone on its line is ignored. Parameters, expressions and control words are errors because their values
-depend on the machine. Codes are in tenths: 901 is G90.1. A code with another meaning in another dialect is an error.
-
-The numbers of a program are rounded, so the centre of an arc (G2, G3) is rarely at the same distance from both ends.
-It is moved by the smallest distance onto the perpendicular bisector of the chord, so that the arc meets both ends
-exactly. LinuxCNC keeps the written centre and runs a spiral instead; the two curves differ by less than the gap.
+The dialect is RS274/NGC as in the LinuxCNC manual, "G-Code Overview", "G-Codes" and "M-Codes". Codes are in tenths: 901
+is G90.1. A code with another meaning in another dialect is an error. The numbers of a program are rounded, so the
+centre of an arc is rarely at the same distance from both ends. It is moved by the smallest distance onto the
+perpendicular bisector of the chord, so that the arc meets both ends exactly. LinuxCNC keeps the written centre and runs
+a spiral instead; the two curves differ by less than the gap.
 """
 
 from __future__ import annotations
@@ -33,12 +30,8 @@ RADIUS_SHARE = 1e-3
 
 
 class ArcError(Exception):
-    """Error raised when the numbers of a G-code line do not describe an arc.
-
-    Attributes:
-        why: Reason.
-        size: Remaining gap, m.
-        limit: Largest gap that is closed, m.
+    """Error that the numbers of a G-code line do not describe an arc: reason, remaining gap, largest gap that is
+    closed, m.
     """
 
     def __init__(self, why: str, size: float, limit: float) -> None:
@@ -47,11 +40,7 @@ class ArcError(Exception):
 
 
 def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bool, gap: float) -> Array:
-    """Return the centre (2,), m, of an arc with given ends and radius; a negative radius selects the longer arc.
-
-    Raises:
-        ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
-    """
+    """Return the centre (2,), m, of an arc with given ends and radius; a negative radius selects the longer arc."""
     chord = end - start
     length = float(np.hypot(*chord))
     if length == 0:
@@ -69,15 +58,9 @@ def arcs_about_center(
 ) -> list[Arc | Helix]:
     """Return the arc or helix about a centre from start to end, or two halves of it if no centre fits both ends.
 
-    Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
-
-    Args:
-        start, end: End points of the arc. Shape (3,), m.
-        center: Centre in the plane. Shape (2,), m.
-        clockwise: Whether the arc turns clockwise about the normal.
-        turns: Number of begun turns: 1 for an arc up to a full circle.
-        plane: Indices of the first axis, the second axis and the normal.
-        gap: Largest difference of the distances from the centre that counts as rounding, m.
+    Two are needed if a circle nearly closes but ends nearer to the centre (2,) than it starts. `turns` is the number of
+    begun turns, `plane` has the indices of the first axis, the second axis and the normal, and `gap` is the largest
+    difference of the distances from the centre that counts as rounding, m.
 
     Raises:
         ArcError: The distances from the centre differ by more than rounding.
@@ -209,12 +192,7 @@ NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the 
 class Block(NamedTuple):
     """Words (letters with numbers) of one line of G-code.
 
-    Attributes:
-        number: Line number in the file, from 1.
-        text: The line as written.
-        codes: G and M words in tenths: ("G", 901) is G90.1.
-        words: Values of all other words by letter.
-        skipped: Whether the line begins with `/`.
+    G and M words are in tenths: ("G", 901) is G90.1. A skipped line begins with `/`. All other words are by letter.
     """
 
     number: int
@@ -232,75 +210,72 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
     """
     inside = False
     for number, text in enumerate(lines, 1):
-        line = text
-        if "(" in line or ")" in line or ";" in line:
-            line = _without_comments(file, number, text)
-        words = line.upper().split()
-        if not words:
-            continue
-        if words[0][0] == "%":
-            if inside:
+        try:
+            words = _without_comments(text).upper().split()
+            if words and words[0][0] == "%" and inside:
                 return
-            inside = True
-            continue
-        inside = True  # a lone % after words also ends the program
-        if ("E" in line or "e" in line) and (exponent := EXPONENT.search(line)):
-            raise line_error(file, number, text, f"{exponent[0]!r} is not a G-code number; write it without E")
-        line = "".join(words)
-        skipped = line[0] == "/"
-        line = DELETED.sub("", line) if skipped else line
-        if "*" in line:
-            line = CHECKSUM.sub("", line)
-        word_pairs = WORD.findall(line)
-        if sum(len(letter) + len(value) for letter, value in word_pairs) != len(line):
-            _refuse(file, number, text, line)
-        codes, values = [], {}
-        for letter, value in word_pairs:
-            if letter in "GM":
-                codes.append((letter, _tenths(file, number, text, letter, value)))
-            elif letter == "O":
-                if not PROGRAM_NUMBER.fullmatch(line):
-                    raise line_error(file, number, text, NOT_RUN)
-            elif letter != "N":
-                if letter in values:
-                    raise line_error(file, number, text, f"{letter} is repeated in one line; remove one")
-                if len(value) > INPUT_LIMITS.number_characters:
-                    why = f"{letter} has more than {INPUT_LIMITS.number_characters} digits"
-                    raise line_error(file, number, text, why)
-                values[letter] = float(value)
-        if codes or values:
-            yield Block(number, text, tuple(codes), values, skipped)
+            if words and words[0][0] != "%" and (block := _block(number, text, words)):
+                yield block
+        except _InvalidBlock as error:
+            raise line_error(file, number, text, str(error)) from error
+        inside = inside or bool(words)  # a lone % after words also ends the program
 
 
-def _without_comments(file: FileName, number: int, text: str) -> str:
-    """Return a line of G-code without its comments; raise ProblemError if a comment is unclosed or nested."""
+class _InvalidBlock(Exception):
+    """Error that a line is not G-code."""
+
+
+def _without_comments(text: str) -> str:
+    """Return a line of G-code without its comments; raise an error if a comment is unclosed or nested."""
     line, semicolon, _ = text.partition(";") if "(" not in text.partition(";")[0] else (text, "", "")
     if not semicolon:
         line = COMMENT.sub(" ", text)
         line = line.partition(";")[0] if "(" not in line.partition(";")[0] else line
     if "(" in line or ")" in line:
-        raise line_error(file, number, text, "a comment is unclosed or nested; close it with one ')'")
+        raise _InvalidBlock("a comment is unclosed or nested; close it with one ')'")
     return line
 
 
-def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
+def _block(number: int, text: str, words: Sequence[str]) -> Block | None:
+    """Return the words of a line, in upper case and without comments, as a block; None if none of them counts."""
+    if exponent := EXPONENT.search(" ".join(words)):
+        raise _InvalidBlock(f"{exponent[0]!r} is not a G-code number; write it without E")
+    line = CHECKSUM.sub("", DELETED.sub("", "".join(words)))
+    word_pairs = WORD.findall(line)
+    if sum(len(letter) + len(value) for letter, value in word_pairs) != len(line):
+        raise _InvalidBlock(_reason(line))
+    codes, values = [], dict[str, float]()
+    for letter, value in word_pairs:
+        if letter in "GM":
+            codes.append((letter, _tenths(letter, value)))
+        elif letter == "O":
+            if not PROGRAM_NUMBER.fullmatch(line):
+                raise _InvalidBlock(NOT_RUN)
+        elif letter != "N":
+            if letter in values:
+                raise _InvalidBlock(f"{letter} is repeated in one line; remove one")
+            if len(value) > INPUT_LIMITS.number_characters:
+                raise _InvalidBlock(f"{letter} has more than {INPUT_LIMITS.number_characters} digits")
+            values[letter] = float(value)
+    return Block(number, text, tuple(codes), values, words[0][0] == "/") if codes or values else None
+
+
+def _tenths(letter: str, value: str) -> int:
     """Return ten times the number of a G or M code, because codes such as G38.2 have one decimal."""
     exact = float(value) * 10 if len(value) < 9 else -1.0
     if exact < 0 or abs(exact - round(exact)) > 1e-6:
-        raise line_error(file, number, text, f"{letter}{value} is not a code; codes have at most one decimal")
+        raise _InvalidBlock(f"{letter}{value} is not a code; codes have at most one decimal")
     return round(exact)
 
 
-def _refuse(file: FileName, number: int, text: str, line: str) -> None:
-    """Raise the ProblemError about a line of G-code that contains something other than letters with numbers."""
+def _reason(line: str) -> str:
+    """Return why a line of G-code contains something other than letters with numbers."""
     if CONTROL.match(line):
-        raise line_error(file, number, text, NOT_RUN)
+        return NOT_RUN
     if any(sign in line for sign in "#[]=<>"):
-        why = "parameters and expressions are not supported; post the program with plain numbers"
-        raise line_error(file, number, text, why)
+        return "parameters and expressions are not supported; post the program with plain numbers"
     rest = WORD.sub("", line)
-    message = f"{rest[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
-    raise line_error(file, number, text, message)
+    return f"{rest[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
 
 
 def code_name(tenths: int) -> str:

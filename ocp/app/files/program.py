@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models import ModelError, Path, SmoothPath, smooth
+from models import Path, SmoothPath, smooth
 from models.checks import Array, ArrayInput
 from models.paths.path import NO_ROTATION, Reversal, fit_splines
-from ocp.errors import ProblemError, require, values_within
+from ocp.errors import ProblemError, problem_errors, require, values_within
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
 DEFAULT_TOLERANCE_M = 5e-5
@@ -153,8 +153,11 @@ class Program:
         return sum(path.length for path in self.paths)
 
     def __str__(self) -> str:
-        counts = _count_text(len(self.paths), "path"), _count_text(len(self.rapids), "rapid")
-        head = f"{counts[0]} of {1e3 * self.length:.6g} mm in all, {counts[1]}"
+        paths, rapids = (
+            f"{count} {noun}{'' if count == 1 else 's'}"
+            for count, noun in ((len(self.paths), "path"), (len(self.rapids), "rapid"))
+        )
+        head = f"{paths} of {1e3 * self.length:.6g} mm in all, {rapids}"
         return "\n".join([head, *(str(note) for note in self.notes)])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = NO_ROTATION) -> Program:
@@ -163,17 +166,18 @@ class Program:
         Raises:
             ModelError: The position is invalid, or the orientation is not a unit quaternion.
         """
-        ends = [self.start, *(end for each in self.rapids for end in (each.start, each.end))]
-        moved = iter(_transform(np.array(ends), position, orientation))
-        start = next(moved)
+        # lines from the origin along the axes check the pose and give its rotation
+        frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
+        origin = np.asarray(frame[0].start)
+        rotation = np.array([np.asarray(line.end) - origin for line in frame])
         sections: list[Section] = []
         for each in self.sections:
             if isinstance(each, Cut):
                 each = replace(each, path=each.path.placed(position, orientation))
             elif isinstance(each, Rapid):
-                each = replace(each, start=next(moved), end=next(moved))
+                each = replace(each, start=origin + each.start @ rotation, end=origin + each.end @ rotation)
             sections.append(each)
-        return Program(tuple(sections), start, self.notes)
+        return Program(tuple(sections), origin + self.start @ rotation, self.notes)
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> tuple[SmoothPath, ...]:
         """Return the paths of all cuts with rounded corners; splines replace runs of short segments of equal feed.
@@ -233,38 +237,21 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
     return float(require.positive(f"{owner}: reversal", value))
 
 
-def _count_text(number: int, noun: str) -> str:
-    """Return a text with a number and its noun, in the plural if necessary."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
-    """Return points (k, 3) rotated by a unit quaternion (w, x, y, z) and then shifted by a position."""
-    # lines from the origin along the axes check the pose and give its rotation
-    frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
-    origin = np.asarray(frame[0].start)
-    return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
-
-
 def smooth_path(
     path: Path, deviation: ArrayInput, options: dict[str, Any], corners: ArrayInput | None = None
 ) -> tuple[SmoothPath, NDArray[np.intp]]:
     """Fit splines to short segments of a path and round its corners within a deviation, see `models.paths.fit_splines`.
 
-    Return also the index of the first segment that each segment of the result replaces.
-
-    Raises:
-        ProblemError: As `models.smooth`.
+    Return also the index of the first segment that each segment of the result replaces; raise the errors of
+    `models.smooth` as ProblemError.
     """
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
         raise ProblemError(message, name=unknown[0], limit=tuple(sorted(known)))
-    try:
+    with problem_errors():
         fitted, first, left = fit_splines(path, deviation, corners=corners)
         return smooth(fitted, deviation=left, **options), first
-    except ModelError as error:
-        raise ProblemError(str(error), **vars(error)) from error
 
 
 class ProgramMotion(NamedTuple):
@@ -343,9 +330,7 @@ class TimedProgram:
             position[members], tangent[members] = point.position, point.tangent
             for name, row in rows.items():
                 row[members] = getattr(motion, name)
-        return ProgramMotion(
-            t, index, rows["distance"], position, tangent, rows["speed"], rows["acceleration"], rows["jerk"]
-        )
+        return ProgramMotion(t, index, position=position, tangent=tangent, **rows)
 
     def _rest(self, which: int) -> Array:
         """Return the position of the tool during a pause, which is the end of the previous move."""

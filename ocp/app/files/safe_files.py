@@ -1,12 +1,8 @@
-"""Read text files from untrusted sources safely, and check where outputs may be written.
+"""Read text files, tables and trees from untrusted sources safely, and check where outputs may be written.
 
-Text is read line by line, JSON and YAML as trees of bounded size and depth, and errors name the line. A tree consists
-of mappings, lists, texts and numbers. An alias of YAML counts with all the values that it stands for, so that a walk
-through the tree ends in bounded time.
-
-An output lies below its folder, has the suffix of its kind and never replaces a foreign file. The contents of a file
-show whether selfmotion wrote it: formats with a place for it name the program; the header of a table or of a message
-has a fixed form; a plan is read.
+JSON and YAML are read as trees of bounded size and depth. An alias of YAML counts with all the values that it stands
+for, so that a walk through the tree ends in bounded time. An output lies below its folder, has the suffix of its kind
+and never replaces a foreign file; the first bytes of a file show whether selfmotion wrote it.
 """
 
 from __future__ import annotations
@@ -15,11 +11,14 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from models.checks import Array
 from models.files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
 from ocp.errors import ProblemError
 from ocp.storage import read_arrays, table_joints
@@ -35,10 +34,7 @@ def read_lines(
 ) -> list[str]:
     """Return the lines of a text file, decoded as UTF-8 or else Latin-1, without a byte order mark.
 
-    Args:
-        file: Name of the file.
-        longest: Largest number of characters in a line; None: unlimited.
-        largest: Largest size of the file, bytes.
+    `longest` is the largest number of characters in a line, None for no limit, and `largest` the largest size in bytes.
 
     Raises:
         ProblemError: The name is invalid; the file cannot be read, is empty, too large, or has a line that is too long
@@ -85,12 +81,66 @@ def missing_package(task: str, package: str, extra: str) -> ProblemError:
     return ProblemError(f"{task} needs the package {package}: {commands}", name=extra, value=package)
 
 
-def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line of a table into cells; if the delimiter is a semicolon, a comma is a decimal point."""
+class TableRow(NamedTuple):
+    """A row of a text table: its line number in the file, the line, and its cells."""
+
+    number: int
+    text: str
+    cells: list[str]
+
+    @property
+    def has_names(self) -> bool:
+        """Whether a cell is neither empty nor a number, so that the row may name the columns."""
+        return any(cell and not is_number(cell) for cell in self.cells)
+
+
+def read_rows(file: FileName) -> tuple[list[TableRow], TableRow]:
+    """Return the rows of a text table, and the last comment before them, which may name the columns, as a row.
+
+    Commas, semicolons, tabs or blanks separate the cells; with a semicolon, a comma is a decimal point. `#` begins a
+    comment.
+    """
+    rows: list[TableRow] = []
+    delimiter, comment = "", (0, "", "")
+    for number, text in enumerate(read_lines(file), 1):
+        line, _, remark = text.partition("#")
+        if line.strip():
+            delimiter = delimiter or next((sign for sign in ";,\t" if sign in line), " ")
+            rows.append(TableRow(number, text, _split_cells(line, delimiter)))
+        elif remark.strip() and not rows:
+            comment = number, text, remark
+    if not rows:
+        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
+    return rows, TableRow(*comment[:2], _split_cells(comment[2], delimiter))
+
+
+def _split_cells(line: str, delimiter: str) -> list[str]:
+    """Split a line of a table into cells."""
     if delimiter == " ":
         return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
-    cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
+    cells = [cell.strip().strip("\"'") for cell in line.strip(" ").split(delimiter)]
     return [cell.replace(",", ".") for cell in cells] if delimiter == ";" else cells
+
+
+def table_numbers(file: FileName, rows: Sequence[TableRow], used: Sequence[bool]) -> Array:
+    """Return the numbers in the used columns of a table, and zeros in the others; nan stands for an empty cell.
+
+    Raises:
+        ProblemError: A row has too many or too few cells, or a cell is not a number; names the line.
+    """
+    width = len(used)
+    for row in rows:
+        if len(row.cells) < width or any(row.cells[width:]):
+            why = f"{len(row.cells)} columns, expected {width}; complete the row"
+            raise line_error(file, row.number, row.text, why, limit=width)
+    cells = [[(cell or "nan") if use else "0" for cell, use in zip(row.cells, used, strict=False)] for row in rows]
+    try:
+        return np.array(cells, dtype=float)
+    except ValueError as error:
+        row, cell = next(
+            (row, cell) for row, own in zip(rows, cells, strict=True) for cell in own if not is_number(cell)
+        )
+        raise line_error(file, row.number, row.text, f"{cell!r} is not a number; correct it") from error
 
 
 def is_number(cell: str) -> bool:
@@ -117,11 +167,8 @@ _NO_KEY = object()
 
 
 def read_tree(file: FileName, kind: str) -> Any:
-    """Return the contents of a JSON file, or of the first document of a YAML file.
-
-    Raises:
-        ProblemError: The file cannot be read, is invalid, or has too many or too deeply nested values; pyyaml is needed
-            and not installed.
+    """Return the contents of a JSON file, or of the first document of a YAML file; raise ProblemError if it is invalid
+    or too large.
     """
     text = "\n".join(read_lines(file, longest=None))
     try:
@@ -269,13 +316,10 @@ SIGNATURES = {
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
-    """Return the path to which an output is written, after checks and with links resolved.
+    """Return the path to which an output is written, with links resolved.
 
-    Args:
-        kind: Kind of the output, a key of SUFFIXES.
-        file: Requested file name.
-        folder: Folder in or below which the output must be; None: anywhere.
-        force: Whether a file that selfmotion did not write may be overwritten.
+    `kind` is a key of SUFFIXES. The output must be in or below `folder`, unless that is None. Only if `force` is set, a
+    file may be overwritten that selfmotion did not write.
 
     Raises:
         ProblemError: The name has a wrong suffix or unprintable characters, is outside of the folder, or belongs to a

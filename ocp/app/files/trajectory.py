@@ -11,6 +11,7 @@ in brackets: `elbow [deg]`, `time [ms]`. Commas, semicolons, tabs or blanks sepa
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,11 +27,11 @@ from ocp.app.files.safe_files import (
     SUFFIXES,
     FileName,
     children_of,
-    is_number,
     line_error,
     read_lines,
+    read_rows,
     read_tree,
-    split_cells,
+    table_numbers,
 )
 from ocp.errors import ProblemError, require
 from ocp.storage import joint_name, table_joints
@@ -139,29 +140,17 @@ def _read_table(
     file: FileName, columns: Sequence[str] | None, period: float | None, joints: frozenset[str]
 ) -> RawTrajectory:
     """Read a joint trajectory from a text table, such as a CSV."""
-    numbers, texts = [], []
-    for number, text in enumerate(read_lines(file), 1):
-        line = text.partition("#")[0]
-        if line.strip(" "):
-            numbers.append(number)
-            texts.append(line.strip(" "))
-    if not texts:
-        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
-    delimiter = next((sign for sign in ";,\t" if sign in texts[0]), " ")
-    first = split_cells(texts[0], delimiter)
-    if columns is None:
-        if all(is_number(cell or "nan") for cell in first):
-            why = "no header names the columns; name them in order: --columns time,NAME,... (columns=)"
-            raise line_error(file, numbers[0], texts[0], why)
-        head, rows, numbers = first, texts[1:], numbers[1:]
-    else:
-        has_header = not all(is_number(cell or "nan") for cell in first)
-        head, rows, numbers = list(columns), texts[has_header:], numbers[has_header:]
+    rows, _ = read_rows(file)
+    first, has_header = rows[0], rows[0].has_names
+    if columns is None and not has_header:
+        why = "no header names the columns; name them in order: --columns time,NAME,... (columns=)"
+        raise line_error(file, first.number, first.text, why)
+    head, rows = first.cells if columns is None else list(columns), rows[has_header:]
     while head and not head[-1].strip():  # a delimiter at the end of every line
         head = head[:-1]
     if not rows:
         raise ProblemError(f"{file}: the file has a header but no sample", name="file", value=str(file))
-    table = _numbers(file, rows, numbers, delimiter, len(head))
+    table = table_numbers(file, rows, [True] * len(head))
     time, columns_of_values, notes = _meanings(file, head, joints)
     if time is None and period is None:
         words = f"{file}: no column is the time among {', '.join(map(repr, head))}; name one `time`, or give the period"
@@ -176,30 +165,8 @@ def _read_table(
     if values["positions"] is None:
         words = f"{file}: no column is a position among {', '.join(map(repr, head))}; name the columns like the joints"
         raise ProblemError(words, name="positions", value=tuple(head))
-    places: dict[str, Any] = {"lines": np.array(numbers), "notes": tuple(notes), "file": str(file)}
+    places: dict[str, Any] = {"lines": np.array([row.number for row in rows]), "notes": tuple(notes), "file": str(file)}
     return RawTrajectory(names, t, **values, names_are_joints=False, **places)
-
-
-def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers in the rows of a table as an array (M, width), with nan for empty cells."""
-    split = [split_cells(row, delimiter) for row in rows]
-    for row, number, cells in zip(rows, numbers, split, strict=True):
-        if len(cells) != width:
-            while len(cells) > width and not cells[-1]:
-                cells.pop()
-            if len(cells) != width:
-                why = f"{len(cells)} columns, the header has {width}; complete the row"
-                raise line_error(file, number, row, why, limit=width)
-    try:
-        return np.array(split, dtype=float)
-    except ValueError:
-        pass
-    for row, number, cells in zip(rows, numbers, split, strict=True):
-        for k, cell in enumerate(cells):
-            if not is_number(cell or "nan"):
-                raise line_error(file, number, row, f"{cell!r} is not a number; correct it")
-            cells[k] = cell or "nan"
-    return np.array(split, dtype=float)
 
 
 def _meanings(
@@ -298,9 +265,8 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
         if missing and kind == "positions":
             raise ProblemError(f"{file}: point {missing[0]} has no positions", name=f"point {missing[0]}")
         if missing:
-            notes.append(
-                f"{len(missing)} of {len(rows)} points have no {kind}, first point {missing[0]}: all are ignored"
-            )
+            count = f"{len(missing)} of {len(rows)} points"
+            notes.append(f"{count} have no {kind}, first point {missing[0]}: all are ignored")
         else:
             values[kind] = _rows(file, word, rows, len(names))
     places: dict[str, Any] = {"lines": np.arange(1, len(points) + 1), "notes": tuple(notes), "file": str(file)}
@@ -351,15 +317,11 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
             notes.append(f"{topic} has {len(messages)} trajectories; only the first is read")
         trajectory = _from_points(file, first)
         return replace(trajectory, notes=(*trajectory.notes, *notes))
-    counts: dict[frozenset[str], int] = {}
-    for _, state in messages:
-        counts[frozenset(state["name"])] = counts.get(frozenset(state["name"]), 0) + 1
-    joint_set = max(counts, key=lambda joints: counts[joints])
-    states = [(stamp, state) for stamp, state in messages if frozenset(state["name"]) == joint_set]
-    if len(states) < len(messages):
-        notes.append(
-            f"{len(messages) - len(states)} of {len(messages)} messages on {topic} are of other joints and are ignored"
-        )
+    joint_sets = [frozenset(state["name"]) for _, state in messages]
+    ((most, _),) = Counter(joint_sets).most_common(1)
+    states = [message for message, joints in zip(messages, joint_sets, strict=True) if joints == most]
+    if (ignored := len(messages) - len(states)) > 0:
+        notes.append(f"{ignored} of {len(messages)} messages on {topic} are of other joints and are ignored")
     names = tuple(states[0][1]["name"])
     if len(set(names)) != len(names) or not names:
         raise ProblemError(f"{file}: the joints {names} on {topic} must be distinct names", name="name", value=names)

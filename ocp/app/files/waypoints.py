@@ -29,9 +29,9 @@ from models.checks import ROUNDING, Array, short_repr, warn_of_degrees, warn_of_
 from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT, rotation_vector
-from models.paths.splines import product
+from models.paths.splines import exponential, product
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smooth_path
-from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
+from ocp.app.files.safe_files import FileName, TableRow, line_error, read_rows, table_numbers
 from ocp.errors import ProblemError, require
 
 POSITION, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
@@ -187,62 +187,53 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     """
     if unit is not None:
         require.choice("waypoints: unit", unit, tuple(LENGTHS))
-    rows = _rows(file)
-    head, first = _head(file, rows, columns)
+    rows, comment = read_rows(file)
+    named = set(POSITION) <= {_name_and_unit(cell)[0] for cell in comment.cells}
+    if named and len(comment.cells) == len(rows[0].cells):  # as numpy.savetxt writes a head
+        rows.insert(0, comment)
+    head, first = _head(file, rows[0], columns)
+    rows = rows[first:]
+    if not rows:
+        raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
     names, scales, ignored = _columns(file, head, unit)
-    table = _table(file, rows[first:], [bool(name) for name in names])
-    lines = np.array([number for number, _, _ in rows[first:]])
+    table = table_numbers(file, rows, [bool(name) for name in names])
+    if (invalid := ~np.isfinite(table).all(axis=1)).any():
+        raise _row_error(file, rows, invalid, "a number is not finite; correct it or drop the line")
     parts = {
         kind: np.column_stack([table[:, names.index(name)] * scales[names.index(name)] for name in kind])
         for kind in KINDS
         if all(name in names for name in kind)
     }
-    row_texts = [text for _, text, _ in rows[first:]]
     times = parts[("time",)][:, 0] if ("time",) in parts else None
-    if times is not None and (np.diff(times) <= 0).any():
-        i = int((np.diff(times) <= 0).argmax()) + 1
-        why = f"the time {times[i]:g} s is not after {times[i - 1]:g} s; sort the rows"
-        raise line_error(file, int(lines[i]), row_texts[i], why)
+    if times is not None and (late := np.append(False, np.diff(times) <= 0)).any():
+        i = int(late.argmax())
+        raise _row_error(file, rows, late, f"the time {times[i]:g} s is not after {times[i - 1]:g} s; sort the rows")
     positions = parts[POSITION]
     if unit is None and not any(
         _name_and_unit(cell)[1] for cell, name in zip(head, names, strict=True) if name in POSITION
     ):
         extent = np.ptp(positions, axis=0).max()
         warn_of_millimetres(f"{file!s}: an extent of the waypoints of", extent, "unit")
-    axes = _axes(file, parts[AXIS], lines, row_texts) if AXIS in parts else None
+    axes = _axes(file, parts[AXIS], rows) if AXIS in parts else None
     orientations = None
     if QUATERNION in parts:
-        orientations = _align_signs(_quaternions(file, parts[QUATERNION], lines, row_texts))
+        orientations = align_signs(_quaternions(file, parts[QUATERNION], rows))
     elif VECTOR in parts:
         warn_of_degrees(f"{file!s}: an angle of the waypoints of", parts[VECTOR], "rx, ry, rz")
-        orientations = _align_signs(_from_vectors(parts[VECTOR]))
+        orientations = align_signs(exponential(parts[VECTOR]))
     elif axes is not None:
-        orientations = _align_signs(_least_roll(file, axes, lines, row_texts))
+        orientations = align_signs(_least_roll(file, axes, rows))
     if QUATERNION in parts or VECTOR in parts:
         axes = None
     used_names = tuple(name for name in names if any(name in kind for kind in parts))
+    lines = np.array([row.number for row in rows])
     return Waypoints(positions, orientations, axes, times, used_names, ignored, lines, str(file))
 
 
-def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return line number, text and cells of each row of a table; a comment that names its columns becomes row 0."""
-    rows: list[tuple[int, str, list[str]]] = []
-    delimiter: str | None = None
-    last_comment = (0, "")
-    for number, text in enumerate(read_lines(file), 1):
-        line, _, comment = text.partition("#")
-        if not line.strip():
-            last_comment = (number, comment) if comment.strip() and not rows else last_comment
-            continue
-        if delimiter is None:
-            delimiter = next((sign for sign in ";,\t" if sign in line), " ")
-        rows.append((number, text, split_cells(line.strip(" "), delimiter)))
-    if not rows or delimiter is None:
-        raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
-    comment_cells = split_cells(last_comment[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
-    if len(comment_cells) == len(rows[0][2]) and set(POSITION) <= {_name_and_unit(cell)[0] for cell in comment_cells}:
-        rows.insert(0, (*last_comment, comment_cells))
-    return rows
+def _row_error(file: FileName, rows: Sequence[TableRow], invalid: Any, why: str, limit: Any = None) -> ProblemError:
+    """Return the error about the first invalid row of a table."""
+    row = rows[int(np.argmax(invalid))]
+    return line_error(file, row.number, row.text, why, limit=limit)
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -252,12 +243,9 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
     return OTHER_NAMES.get(name, name), match[2] if match else None
 
 
-def _head(
-    file: FileName, rows: list[tuple[int, str, list[str]]], columns: Sequence[str] | None
-) -> tuple[list[str], int]:
+def _head(file: FileName, first: TableRow, columns: Sequence[str] | None) -> tuple[list[str], int]:
     """Return the column names that the header or the caller gives, and the index of the first data row."""
-    cells = rows[0][2]
-    has_header = any(cell and not is_number(cell) for cell in cells)
+    cells = first.cells
     if columns is not None:
         names = [] if isinstance(columns, str) else list(require.each("columns", columns, str))
         if len(names) != len(cells):
@@ -265,12 +253,12 @@ def _head(
             raise ProblemError(message, name="columns", value=columns, limit=len(cells))
         labels = [cell for cell in cells if cell]
         is_enumeration = len(labels) > 1 and labels == [str(i) for i in range(len(labels))]
-        return names, 1 if has_header or is_enumeration or len(labels) < len(cells) else 0
-    if has_header:
+        return names, 1 if first.has_names or is_enumeration or len(labels) < len(cells) else 0
+    if first.has_names:
         return cells, 1
     if len(cells) != 3:
         why = f"no header names the {len(cells)} columns; name them there, or with columns=('x', 'y', 'z', ...)"
-        raise line_error(file, rows[0][0], rows[0][1], why)
+        raise line_error(file, first.number, first.text, why)
     return list(POSITION), 0
 
 
@@ -312,64 +300,31 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
     return names, scales, tuple(ignored)
 
 
-def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequence[bool]) -> Array:
-    """Return the cells of a table as numbers, with zeros in unused columns. Shape (M, number of columns)."""
-    if not rows:
-        raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
-    width = len(used)
-    table = np.zeros((len(rows), width))
-    for i, (number, text, cells) in enumerate(rows):
-        if len(cells) < width or any(cells[width:]):
-            raise line_error(
-                file, number, text, f"{len(cells)} columns, expected {width}; complete the row", limit=width
-            )
-        for k in range(width):
-            if used[k]:
-                try:
-                    table[i, k] = float(cells[k])
-                except ValueError:
-                    raise line_error(file, number, text, f"{cells[k]!r} is not a number; correct it") from None
-    invalid = ~np.isfinite(table).all(axis=1)
-    if invalid.any():
-        number, text, _ = rows[int(invalid.argmax())]
-        raise line_error(file, number, text, "a number is not finite; correct it or drop the line")
-    return table
-
-
-def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
+def _quaternions(file: FileName, values: Array, rows: Sequence[TableRow]) -> Array:
     """Normalise quaternions; raise ProblemError if the norm of a quaternion differs from 1 by more than 0.01."""
     norm = np.linalg.norm(values, axis=1)
     norm_tolerance = 1e-2  # a larger deviation is not explained by rounding in the file
-    invalid = np.abs(norm - 1) > norm_tolerance
-    if invalid.any():
-        i = int(invalid.argmax())
-        why = f"the quaternion has the norm {norm[i]:.6g}; give a unit quaternion"
-        raise line_error(file, int(lines[i]), texts[i], why, limit=norm_tolerance)
+    if (invalid := np.abs(norm - 1) > norm_tolerance).any():
+        why = f"the quaternion has the norm {norm[invalid.argmax()]:.6g}; give a unit quaternion"
+        raise _row_error(file, rows, invalid, why, norm_tolerance)
     return np.asarray(values / norm[:, None])
 
 
-def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
+def _axes(file: FileName, values: Array, rows: Sequence[TableRow]) -> Array:
     """Return the tool axes (M, 3) of a table as unit vectors; raise ProblemError, with the line, if one is zero."""
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
-        i = int((norm > 0).argmin())
-        raise line_error(file, int(lines[i]), texts[i], "the tool's axis is zero; give a direction")
+        raise _row_error(file, rows, ~(norm > 0), "the tool's axis is zero; give a direction")
     return np.asarray(values / norm[:, None])
 
 
-def _from_vectors(vectors: Array) -> Array:
-    """Convert rotation vectors (M, 3), rad, to unit quaternions (M, 4)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None]
-    return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
-
-
-def _align_signs(quaternions: Array) -> Array:
+def align_signs(quaternions: Array) -> Array:
     """Choose the sign of each quaternion so that the quaternion is as close as possible to the previous one."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
-def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
+def _least_roll(file: FileName, axes: Array, rows: Sequence[TableRow]) -> Array:
     """Return orientations with the given tool axes as z axes and with least rotation about these axes."""
     previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
@@ -378,9 +333,8 @@ def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Seq
         steps[0], opposite[0] = (0.0, 1.0, 0.0, 0.0), False  # upside down: about x
     if opposite.any():
         i = int(opposite.argmax())
-        why = f"the tool axis is opposite to that of line {lines[i - 1]}, so the direction of the turn is ambiguous; "
-        why += "insert a waypoint between them"
-        raise line_error(file, int(lines[i]), texts[i], why)
+        why = f"the tool axis is opposite to that of line {rows[i - 1].number}, so the direction of the turn is "
+        raise _row_error(file, rows, opposite, f"{why}ambiguous; insert a waypoint between them")
     steps = steps / np.linalg.norm(steps, axis=1)[:, None]
     orientations = np.empty_like(steps)
     current = np.array([1.0, 0.0, 0.0, 0.0])

@@ -1,7 +1,6 @@
 """Sample a motion for display; the motion is a plan, the solution of any problem, or any joint trajectory.
 
-Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as they are
-known. Curves over time show the joints, torques, costs and the motion of the base with their limits.
+Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as known.
 """
 
 from __future__ import annotations
@@ -12,13 +11,14 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import FreeFloating, Machine, Standing
 from models.checks import Array
 from models.machines.standing import center_of_pressure
 from ocp.app.check.data_checks import clean_trajectory
-from ocp.app.check.interpolation import interpolate
-from ocp.app.check.joint_limits import Row, integrate_base, torque_expression
+from ocp.app.check.joint_limits import Row, interpolate
+from ocp.app.check.motion_checks import integrate_base, torque_expression
 from ocp.app.check.verdict import PlanVerdict, audit_rows, verdict_of
 from ocp.app.files import RawTrajectory
 from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
@@ -31,17 +31,15 @@ from ocp.motion.tasks.targets import Target
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
-from ocp.solution_data import match_order
+from ocp.solution_data import match_order, unstack
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A quantity as a function of time along a motion.
+    """A quantity as a function of time along a motion; curves of one group share a diagram.
 
     Attributes:
-        group: Curves of one group share a diagram.
-        name: Name of the quantity.
-        unit: Unit of the quantity; "" if it has none.
+        group, name, unit: Group, name and unit of the quantity; the unit is "" if it has none.
         values: Values at the motion's M times. Shape (M,).
         lower, upper: Limits of the quantity, infinite if there are none.
     """
@@ -55,14 +53,9 @@ class Curve:
 
 
 class MotionSamples(NamedTuple):
-    """Samples of a motion at M times.
+    """Times (M,), s, joint positions and velocities (M, n), and base configurations (M, base_size) of a motion.
 
-    Attributes:
-        t: Times, s. Shape (M,).
-        joints, rates: Joint positions and velocities. Shape (M, n).
-        accelerations: Joint accelerations, shape (M, n), or None if the motion is not smooth enough.
-        base: Base configurations. Shape (M, base_size).
-        base_rates: Their time derivatives, shape (M, base_size), or None if they are unknown.
+    Accelerations are None if the motion is not smooth enough, base rates if they are unknown.
     """
 
     t: Array
@@ -75,13 +68,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Contact polygon of a standing machine, and the zero moment points during its motion.
-
-    Attributes:
-        corners: Corners of the contact area. Shape (k, 2), m.
-        points: Zero moment points at the motion's M times. Shape (M, 2), m.
-        forces: Whether the points take external forces into account.
-    """
+    """Corners (k, 2), m, of the contact area, and zero moment points (M, 2), m, with or without external forces."""
 
     corners: Array
     points: Array
@@ -90,19 +77,21 @@ class GroundContact:
 
 def joint_curves(machine: Machine, bounds: JointBounds, samples: MotionSamples) -> list[Curve]:
     """Return curves of the positions, velocities and torques of all joints, with the limits of these quantities."""
-    robot, curves = machine.robot, []
-    torques = _torques(machine, samples)
+    joints, torques = machine.robot.moving_joints, _torques(machine, samples)
     torque_group = "Torques, without external forces" if isinstance(machine, Standing) else "Torques"
-    for k, joint in enumerate(robot.moving_joints):
-        curves.append(Curve("Joints", joint.name, joint.unit, samples.joints[:, k], bounds.lower[k], bounds.upper[k]))
-    for k, joint in enumerate(robot.moving_joints):
-        limit = float(bounds.velocity[k])
-        curves.append(Curve("Joint velocities", joint.name, f"{joint.unit}/s", samples.rates[:, k], -limit, limit))
-    for k, joint in enumerate(robot.moving_joints if torques is not None else ()):
-        assert torques is not None
-        limit = float(bounds.torque[k])
-        curves.append(Curve(torque_group, joint.name, joint.effort_unit, torques[:, k], -limit, limit))
-    return curves
+    units, rate_units = [joint.unit for joint in joints], [f"{joint.unit}/s" for joint in joints]
+    quantities = [
+        ("Joints", units, samples.joints, bounds.lower, bounds.upper),
+        ("Joint velocities", rate_units, samples.rates, -bounds.velocity, bounds.velocity),
+    ]
+    if torques is not None:
+        effort_units = [joint.effort_unit for joint in joints]
+        quantities.append((torque_group, effort_units, torques, -bounds.torque, bounds.torque))
+    return [
+        Curve(group, joint.name, units[k], values[:, k], float(lower[k]), float(upper[k]))
+        for group, units, values, lower, upper in quantities
+        for k, joint in enumerate(joints)
+    ]
 
 
 def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
@@ -152,11 +141,8 @@ def ground_contact(
 ) -> tuple[GroundContact, list[Curve]]:
     """Return the zero moment points of a standing machine and a curve of their distance from the edge of the foot.
 
-    Args:
-        machine: The machine.
-        samples: Samples of the motion, with accelerations.
-        inside: Distances inside each edge, up to a constant margin, from a problem that includes external forces.
-            Without them the external forces are unknown.
+    `inside` has the distances inside each edge, up to a constant margin, from a problem that includes external forces.
+    Without it the external forces are unknown.
     """
     normals, corners = machine.support.normals, np.asarray(machine.support.vertices)
     if len(inside) == len(normals):
@@ -177,11 +163,6 @@ def ground_contact(
     )
     name = "zero moment point from the edge of the foot, without external forces"
     return GroundContact(corners, points, False), [Curve("Standing", name, "m", margins[:, 0], 0.0)]
-
-
-def cumulative_integral(t: Array, values: Array) -> Array:
-    """Integrate samples (M,) from the first time to each time, by the trapezoidal rule. Shape (M,)."""
-    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])
 
 
 ZMP_CONSTRAINT = "zero moment point"
@@ -218,8 +199,7 @@ class ClosestPairs(NamedTuple):
     Attributes:
         t: Times, s. Shape (K,).
         points: Closest points of the cores of both bodies, in world. Shape (K, 2, 3), m.
-        distances: Distances of the bodies, m. Shape (K,).
-        required: Required distances. Shape (K,), m.
+        distances, required: Distances of the bodies, and required ones. Shape (K,), m.
         bodies: Names of the two bodies at each time.
     """
 
@@ -235,11 +215,8 @@ class Animation:
     """A sampled motion with all data about the motion that a page displays.
 
     Attributes:
-        name: Name of the motion.
-        machine: The machine that moves.
-        t: Times, s. Shape (M,).
-        joints: Joint positions. Shape (M, n).
-        base: Base configurations. Shape (M, base_size).
+        name, machine: Name of the motion, and the machine that moves.
+        t, joints, base: Times (M,), s, joint positions (M, n) and base configurations (M, base_size).
         curves: Quantities over time.
         targets: Targets of the tips.
         footing: Contact with the ground; None for a machine that does not stand.
@@ -320,17 +297,14 @@ def animate_solution(
             raise ProblemError(words, name=state, value=actual, limit=size)
     times = _times(solution.horizon)
     fractions = times / solution.horizon
-    columns, at = {}, 0
-    for state, values in solution.states.items():
-        columns[state] = slice(at, at + values.shape[1])
-        at += values.shape[1]
     curve = solution.state_interpolant
-    states = curve(fractions)
-    slopes = curve.derivative()(fractions) / solution.horizon
-    second_derivatives = curve.derivative().derivative()(fractions) / solution.horizon**2
-    q, v, a = (samples[:, columns[joints]] for samples in (states, slopes, second_derivatives))
-    base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
-    base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
+    curves = curve, curve.derivative(), curve.derivative().derivative()
+    derivatives = [
+        unstack(solution.states, each(fractions) / solution.horizon**order) for order, each in enumerate(curves)
+    ]
+    q, v, a = (samples[joints] for samples in derivatives)
+    none = np.zeros((len(times), 0))
+    base_path, base_rates = (samples[base] if machine.base_size else none for samples in derivatives[:2])
     details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of([(solution, "", times)]))}
     details |= _audit_verdict([solution], lambda: solution.audit(**settings))
     times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
@@ -354,20 +328,16 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
         words = f"{raw.file} does not move {missing}; lock them: --lock {missing[0]}=VALUE"
         raise ProblemError(words, name=missing[0], value=raw.file)
     motion = cleaned.motion
-    begin, end = float(motion.t[0]), float(motion.t[-1])
-    times = _times(end - begin)
-    joints, rates = motion.position.at(begin + times), motion.velocity.at(begin + times)
-    accelerations = None if motion.acceleration is None else motion.acceleration.at(begin + times)
+    times = _times(float(motion.t[-1] - motion.t[0]))
+    at = motion.t[0] + times
     base, base_rates = np.zeros((len(times), 0)), None
-    if machine.base_size:
-        base_path = cleaned.base
-        if base_path is None:
-            assert isinstance(machine, FreeFloating)
-            base_path = integrate_base(machine, motion)[0]  # by conservation of momentum
-        else:
-            base_rates = interpolate(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
-        base = interpolate(begin + times, motion.t, base_path)
-    samples = MotionSamples(times, joints, rates, accelerations, base, base_rates)
+    if isinstance(machine, FreeFloating) and cleaned.base is None:
+        base = interpolate(at, motion.t, integrate_base(machine, motion)[0])  # by conservation of momentum
+    elif cleaned.base is not None and machine.base_size:
+        base = interpolate(at, motion.t, cleaned.base)
+        base_rates = interpolate(at, motion.t, np.gradient(cleaned.base, motion.t, axis=0))
+    accelerations = None if motion.acceleration is None else motion.acceleration.at(at)
+    samples = MotionSamples(times, motion.position.at(at), motion.velocity.at(at), accelerations, base, base_rates)
     return _animation(name or raw.file, machine, samples, [])
 
 
@@ -376,7 +346,7 @@ def _animation(
 ) -> Animation:
     """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
-    effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
+    effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
     costs = [one for one in own_curves if one.group == "Cost"]
     curves += [one for one in costs if abs(one.values[-1] - effort[-1]) > relative * max(abs(effort[-1]), 1e-12)]
@@ -422,9 +392,8 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """Return the integral of the problem's running cost and every entry of its path constraints as curves.
-
-    The group of an entry is the name of its constraint.
+    """Return the integrated running cost of a problem and every entry of its path constraints, grouped by constraint,
+    as curves.
     """
     if solution.problem is None:
         return []
@@ -434,7 +403,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
     p = form.parameter_vector(ordered.parameters)
     running, rows = form.sampled([form.running, form.path.expression], x, u, times, ordered.horizon, p)
     lower, upper = (side[form.path.bounds] for side in form.bound_values(p))
-    integral = cumulative_integral(fractions * ordered.horizon, running[:, 0])
+    integral = scipy.integrate.cumulative_trapezoid(running[:, 0], fractions * ordered.horizon, initial=0.0)
     return [Curve("Cost", "the problem's own cost, integrated", "", integral)] + [
         Curve(owner, label, form.units[owner], rows[:, k], float(lower[k]), float(upper[k]))
         for k, (owner, label) in enumerate(zip(form.path.owners, form.path.labels, strict=True))
@@ -461,9 +430,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
     """Return the closest pair of bodies at uniform times of a motion, or None if the pairs are unknown.
 
-    Args:
-        parts: Solutions, suffixes and times as returned by `Plan.solved_parts` for these times.
-        horizon: Duration of the motion, s.
+    `parts` are solutions, suffixes and times as returned by `Plan.solved_parts` for these times.
     """
     pairs = [
         pair

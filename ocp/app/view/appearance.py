@@ -1,16 +1,16 @@
 """Surfaces of robots and obstacles, their frames along a motion, and the colours of all pictures.
 
-A link is shown by its visual shapes, or without them by its collision shapes. A mesh that is not found is reported and
-replaced by the collision shapes. These are transparent if the description gives other links visual shapes and this one
-none. A link with neither is a rod from joint to joint. Nothing is derived from masses and inertias.
-
-The colours are distinguishable with every kind of colour vision (Okabe, Ito 2008).
+A link is shown by its visual shapes, or without them by its collision shapes; these are transparent if the description
+gives other links visual shapes and this one none. A mesh that is not found is reported and replaced by the collision
+shapes. A link with neither is a rod from joint to joint. Nothing is derived from masses and inertias. The colours are
+distinguishable with every kind of colour vision (Okabe, Ito 2008).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -42,8 +42,7 @@ class SurfaceStyle:
         min_cell: Initial size of the cells in which corners are merged, m; doubled until there are few enough faces.
         crease: Faces that meet at a larger angle are shaded separately, rad.
         max_neighbours: Largest number of faces at a corner that are shaded as one surface.
-        sides: Number of sides of round shapes.
-        rod_radius: Relative to the longest distance between joints.
+        sides, rod_radius: Sides of round shapes; radius of rods, relative to the longest distance between joints.
         patch: Half the side of the drawn part of a plane, relative to the diagonal of what moves in front of it.
     """
 
@@ -60,17 +59,15 @@ class SurfaceStyle:
 
 
 SURFACE_STYLE = SurfaceStyle()
+Solid = tuple[Array, NDArray[np.intp]]
+"""Surface of a solid: corners (k, 3), m, and triangles as indices of corners (f, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A surface of triangles that has one colour and is carried by a link.
+    """A surface of triangles that has one colour (red, green, blue and opacity, 0 to 1) and is carried by a link.
 
-    Attributes:
-        link: Name of the link that carries the surface.
-        vertices, normals: Vertices (m) and unit normals in the frame of the link. Shape (n, 3) each.
-        faces: Indices of the triangles' corners. Shape (f, 3).
-        color: Red, green, blue and opacity, 0 to 1.
+    Vertices (n, 3), m, and unit normals (n, 3) are in the frame of the link, faces (f, 3) are indices of vertices.
     """
 
     link: str
@@ -82,11 +79,8 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """Surfaces with which a robot is displayed, and the meshes that are missing.
-
-    Attributes:
-        parts: Surfaces of all links.
-        missing: Meshes that are not shown, as named in the description, and the reasons.
+    """Surfaces with which a robot is displayed, and the meshes that are not shown, as named in the description, with
+    reasons.
     """
 
     parts: tuple[Part, ...]
@@ -96,13 +90,10 @@ class Appearance:
 def appearance_of(
     robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """Return the surfaces with which the links of a robot are displayed.
+    """Return the surfaces with which the links of a robot are displayed, modified or not: shapes move with their links.
 
-    Args:
-        robot: The robot, modified or not: shapes move with the links into which theirs were merged.
-        folders: Folders that are searched first for meshes, see `models.shapes.mesh_files.find_mesh`.
-        meshes: Whether mesh files are read.
-        most: Largest number of faces, above which nearby corners are merged.
+    `folders` are searched first for `meshes`, which are read if that is set. If there are more than `most` faces,
+    nearby corners are merged.
     """
     missing: dict[str, str] = {}
     has_visuals = any(link.visuals for link in robot.links)
@@ -154,45 +145,31 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
         mirrored = np.prod(size) < 0
         return Triangles(vertices * size, faces[:, ::-1] if mirrored else faces, colors)
     if shape.kind == "box":
-        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-        quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-        return without_colors(signs * size, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
-    if shape.kind == "cylinder":
-        half = size[1] / 2
-        return _revolution_surface(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
-    half = size[1] / 2 if shape.kind == "capsule" else 0.0
-    angles = np.linspace(-np.pi / 2, 0, SURFACE_STYLE.sides // 4 + 1)
-    cap = np.column_stack([np.cos(angles), np.sin(angles)]) * size[0]
-    upper = cap[::-1] * [1, -1] + [0, half]
-    return _revolution_surface(np.concatenate([cap - [0, half], upper if half else upper[1:]]))
+        surface = inflated_hull(size / 2 * list(product((-1.0, 1.0), repeat=3)))
+    else:
+        ends = np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]]) * (0.0 if shape.kind == "sphere" else size[1])
+        surface = rod(ends[0], ends[1], size[0])[:2] if shape.kind == "cylinder" else inflated_hull(ends, size[0])
+    return without_colors(*surface)
 
 
-def _revolution_surface(profile: Array) -> Triangles:
-    """Return the surface that a profile of points (radius, z), shape (k, 2), generates by rotation about z."""
+def inflated_hull(points: Array, radius: float = 0.0) -> Solid:
+    """Return the surface of the convex hull of points (k, 3), inflated by a radius."""
     sides = SURFACE_STYLE.sides
-    angle = np.arange(sides) * (2 * np.pi / sides)
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    radii, heights = profile[:, 0], profile[:, 1]
-    points = np.concatenate([radii[:, None, None] * ring, np.tile(heights[:, None, None], (1, sides, 1))], axis=2)
-    k, i = (part.ravel() for part in np.meshgrid(np.arange(len(profile) - 1), np.arange(sides), indexing="ij"))
-    a, b = k * sides + i, k * sides + (i + 1) % sides
-    quads = np.stack([a, b, b + sides, a + sides], axis=1)
-    return without_colors(points.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
+    u, v = np.meshgrid(np.arange(sides) * (2 * np.pi / sides), np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1))
+    unit = np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1).reshape(-1, 3)
+    hull = convex_hull((points[:, None] + radius * unit).reshape(-1, 3) if radius > 0 else points)
+    return np.asarray(hull.vertices), hull.faces
 
 
 def rod(start: Array, end: Array, radius: float) -> Triangles:
     """Return the surface of a round rod between two points."""
-    along = end - start
-    length = float(np.linalg.norm(along))
-    axis = along / length
-    coordinate_axis = np.eye(3)[int(np.abs(axis).argmin())]
-    first = np.cross(axis, coordinate_axis)
+    axis = (end - start) / np.linalg.norm(end - start)
+    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     first /= np.linalg.norm(first)
-    rotation = np.column_stack([first, np.cross(axis, first), axis])
-    half = length / 2
-    profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
-    vertices, faces, _ = _revolution_surface(profile)
-    return Triangles(vertices @ rotation.T + (start + end) / 2, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
+    angle = np.arange(SURFACE_STYLE.sides)[:, None] * (2 * np.pi / SURFACE_STYLE.sides)
+    ring = radius * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
+    vertices, faces = inflated_hull(np.concatenate([start + ring, end + ring]))
+    return Triangles(vertices, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
 
 
 def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
@@ -299,11 +276,8 @@ TIP_FRAME = "the tip frame"
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of the links and of the tip in the world along a motion, keyed by link name or TIP_FRAME.
-
-    Attributes:
-        rotations: Axes as columns. Shape (M, 3, 3) each.
-        positions: Origins. Shape (M, 3) each, m.
+    """Frames of the links and of the tip in the world along a motion, by link name or TIP_FRAME: axes as columns (M, 3,
+    3), and origins (M, 3), m.
     """
 
     rotations: dict[str, Array]
@@ -318,10 +292,7 @@ class Frames:
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
     """Return the frames of all links, and of the tip if the robot has one, in the world along a motion.
 
-    Args:
-        machine: The robot on its base.
-        joints: Joint positions in the order of robot.joint_names. Shape (M, dof).
-        base: Base configurations, shape (M, base_size); None for a fixed base.
+    Joint positions (M, dof) are in the order of robot.joint_names, base configurations have the shape (M, base_size).
 
     Raises:
         ModelError: A size is wrong.
@@ -345,19 +316,11 @@ def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
     return Frames(rotations, {name: values[:, i, 9:] for i, name in enumerate(frames)})
 
 
-Solid = tuple[Array, NDArray[np.intp]]
-"""Surface of a solid: corners (k, 3), m, and triangles as indices of corners (f, 3)."""
-
-
 class Obstacle(NamedTuple):
-    """An obstacle for display: the convex hull of points inflated by a radius, or a half-space.
+    """An obstacle for display: the convex hull of points (k, 3), m, inflated by a radius, or a half-space.
 
-    Attributes:
-        core: Points. Shape (k, 3), m; for a half-space one point of its plane.
-        radius: Radius by which the hull is inflated, m.
-        normal: Outward normal of a half-space, shape (3,); otherwise None.
-        rotations, positions: Frame of the body in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None
-            if it is static, with points in world.
+    A half-space has one point of its plane and its outward normal. `rotations` (M, 3, 3) and `positions` (M, 3), m, are
+    those of the body in world at the times of a motion; None if it is static, with points in world.
     """
 
     core: Array
@@ -369,13 +332,7 @@ class Obstacle(NamedTuple):
     def solid(self, points: Array) -> Solid:
         """Return the surface of the obstacle in its own frame; a half-space becomes a square near points (k, 3)."""
         if self.normal is None:
-            offsets = np.zeros((1, 3))
-            if self.radius > 0:
-                u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(-np.pi / 2, np.pi / 2, 7))
-                unit = np.stack([np.cos(v) * np.cos(u), np.cos(v) * np.sin(u), np.sin(v)], axis=-1)
-                offsets = self.radius * unit.reshape(-1, 3)
-            hull = convex_hull((np.asarray(self.core)[:, None] + offsets).reshape(-1, 3))
-            return np.asarray(hull.vertices), hull.faces
+            return inflated_hull(np.asarray(self.core), self.radius)
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
         middle = middle - self.normal * (self.normal @ (middle - self.core[0]))
@@ -398,11 +355,8 @@ def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
 def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
     """Return, for display, the obstacles that the optimal control problems of a motion declare.
 
-    A moving obstacle is attached to a frame that depends on time but on no state.
-
-    Args:
-        parts: Parts of a motion in sequence: a solution, whose problem declares the separations; the suffix of the
-            names of its states, "" for a single part; and the times in the solution, shape (K,), s, to evaluate.
+    A moving obstacle is attached to a frame that depends on time but on no state. `parts` are the parts of the motion
+    in sequence: a solution; the suffix of the names of its states, "" for a single part; and times in the solution, s.
     """
     static: dict[str, Obstacle] = {}
     moving: dict[str, list[tuple[Any, Array, Array]]] = {}

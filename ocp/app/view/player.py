@@ -1,12 +1,9 @@
 """Create a web page that plays motions and shows their curves and audits, and serve the page on this machine.
 
-The page contains its geometry and scripts, and its policy forbids requests to any host, so that it plays from a file
-without a server. `selfmotion view` serves the same page until Ctrl-C. A request must name this machine as its host,
-which excludes the page of a stranger whose domain resolves to this machine.
-
-Scene and curves are drawn by scripts of our own (ocp/app/view/page/). The clients of viewer libraries also play
-recordings, but they neither report the displayed time nor let it be set, which the time cursor of the curves needs,
-and they are larger than this page.
+The page contains its geometry and scripts (ocp/app/view/page/), and its policy forbids requests to any host, so that it
+plays from a file without a server. Clients of viewer libraries neither report the displayed time nor let it be set,
+which the cursor of the curves needs. A request to the server must name this machine as its host, which excludes the
+page of a stranger whose domain resolves to this machine.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from numpy.typing import NDArray
 from models import Robot
 from models.checks import Array
 from models.spatial import quaternion_from_rotation
+from ocp.app.files.waypoints import align_signs
 from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
@@ -56,12 +54,7 @@ class Buffers:
 
 
 class Page(NamedTuple):
-    """A web page that plays a motion.
-
-    Attributes:
-        text: HTML of the page.
-        missing: Meshes that are not shown, as named in the descriptions, and the reasons.
-    """
+    """A web page that plays a motion: its HTML, and the meshes that are not shown with the reasons."""
 
     text: str
     missing: dict[str, str]
@@ -77,12 +70,8 @@ def build_page(
 ) -> Page:
     """Return the page that plays one motion, or a motion and others to compare it with.
 
-    Args:
-        shown: The motions.
-        title: Title of the page; "": the name of the first motion.
-        folders: Folders that are searched first for meshes.
-        meshes: Whether mesh files are read; otherwise collision shapes are shown.
-        workpiece: Vertices in world, m, and triangles of a body that is shown as well. Shapes (k, 3) and (f, 3).
+    `folders` are searched first for `meshes`; without meshes collision shapes are shown. `workpiece` has vertices (k,
+    3) in world, m, and triangles (f, 3) of a body that is shown as well.
 
     Raises:
         ProblemError: There is no motion, or the page is too large.
@@ -138,40 +127,21 @@ def _look_alike(a: Robot, b: Robot) -> bool:
         [(shape.kind, shape.file, tuple(np.ravel(shape.translation))) for link in robot.links for shape in link.visuals]
         for robot in (a, b)
     ]
-    return looks[0] == looks[1] and all(a.moves == b.moves for a, b in zip(a.joints, b.joints, strict=True))
-
-
-def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link, or the root, that carries it, and its rotation and position there."""
-    carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
-    for joint in robot.joints:
-        if joint.moves:
-            carriers[joint.child] = (joint.child, np.eye(3), np.zeros(3))
-            continue
-        carrier, rotation, shift = carriers[joint.parent]
-        carriers[joint.child] = (carrier, rotation @ joint.rotation, shift + rotation @ np.asarray(joint.translation))
-    return carriers
-
-
-def _movers(robot: Robot) -> list[str]:
-    """Return the names of the root and of the moving links, whose frames the page animates."""
-    return [robot.root, *(joint.child for joint in robot.joints if joint.moves)]
+    return looks[0] == looks[1]
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a robot for the page: its surfaces, in the frames of its moving links, with colours."""
-    carriers, movers = _carriers(robot), _movers(robot)
-    parts = []
-    for part in appearance.parts:
-        carrier, rotation, translation = carriers[part.link]
-        parts.append(
-            {
-                "mover": movers.index(carrier),
-                "link": part.link,
-                "color": [round(float(value), 4) for value in part.color],
-                **_surface(part.vertices @ rotation.T + translation, part.normals @ rotation.T, part.faces, buffers),
-            }
-        )
+    """Return the description of a robot for the page: its surfaces, in the frames of its links, with their colours."""
+    movers = [link.name for link in robot.links]
+    parts = [
+        {
+            "mover": movers.index(part.link),
+            "link": part.link,
+            "color": [round(float(value), 4) for value in part.color],
+            **_surface(part.vertices, part.normals, part.faces, buffers),
+        }
+        for part in appearance.parts
+    ]
     return {"name": robot.name, "movers": movers, "parts": parts}
 
 
@@ -196,9 +166,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
     """Return the poses of k frames as positions and quaternions, with signs continuous in time. Shape (M, k, 7)."""
     poses = []
     for name in names:
-        quaternions = quaternion_from_rotation(frames.rotations[name])
-        signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-        quaternions[1:] *= np.cumprod(signs)[:, None]
+        quaternions = align_signs(quaternion_from_rotation(frames.rotations[name]))
         poses.append(np.column_stack([frames.positions[name], quaternions]))
     return np.stack(poses, axis=1)
 
@@ -209,7 +177,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
     points = np.vstack([*frames.positions.values()])
-    movers = _movers(motion.machine.robot)
+    movers = [link.name for link in motion.machine.robot.links]
     obstacles = []
     for number, obstacle in enumerate(motion.obstacles):
         mover = None
@@ -232,12 +200,10 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
         "time": buffers.put(motion.t, "f4"),
         "curves": [
             {
-                "group": curve.group,
-                "name": curve.name,
-                "unit": curve.unit,
+                **vars(curve),
                 "values": buffers.put(curve.values, "f4"),
-                "lower": float(curve.lower) if np.isfinite(curve.lower) else None,
-                "upper": float(curve.upper) if np.isfinite(curve.upper) else None,
+                "lower": _plain(curve.lower),
+                "upper": _plain(curve.upper),
             }
             for curve in motion.curves
         ],
@@ -291,18 +257,10 @@ HOST = "127.0.0.1"
 
 
 class PageServer:
-    """Context manager that serves one page by HTTP to browsers on this machine.
-
-    Attributes:
-        address: Address to open in a browser.
-    """
+    """Context manager that serves one page by HTTP at `address` to browsers on this machine."""
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port.
-
-        Raises:
-            ProblemError: No port is free, or the number is invalid.
-        """
+        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port."""
         self._server = _start_server(text.encode(), port)
         self.address = f"http://{HOST}:{self._server.server_address[1]}"
         self._thread = Thread(target=self._server.serve_forever, name="page", daemon=True)

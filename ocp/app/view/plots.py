@@ -1,7 +1,6 @@
 """Plot plans and solutions with limits, compare them with other motions, and display them in notebooks.
 
-`Plan.plot` and `Solution.plot` call these functions. The figures are matplotlib figures without a window: a notebook
-displays them, and `figure.savefig` writes them. A figure of pyplot can be passed instead.
+The figures are matplotlib figures without a window: a notebook displays them, and `figure.savefig` writes them.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -17,10 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from models.checks import Array
-from ocp.app.check.interpolation import Motion
-from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
+from ocp.app.check.joint_limits import Fault, Motion
+from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
-from ocp.app.view.report import KINDS, bounds_of, curve_samples, limits_in_view
 from ocp.errors import ProblemError, require
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
@@ -36,12 +34,61 @@ STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False,
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
+KINDS = {"position": "", "velocity": "/s", "acceleration": "/s²"}
+"""Quantities of a joint that are drawn over time, and the suffix that turns rad or m into the unit of the quantity."""
+
+
+class LimitView(NamedTuple):
+    """Ends of the axis of a diagram, limits that are drawn as lines, and a text about distant ones at an edge."""
+
+    low: float
+    high: float
+    lines: tuple[float, ...]
+    text: str
+    text_below: bool
+
+
+def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_range: float) -> LimitView:
+    """Return how a diagram shows the limits of curves with values from `low` to `high`.
+
+    Limits near the curves are drawn as lines, limits far away are given as text, to keep the shape of the curves
+    visible. Curves with a range smaller than `min_range` are drawn as constant.
+    """
+    if not np.isfinite([low, high]).all():
+        low = high = 0.0
+    span = max(high - low, min_range) or 1.0
+    lines, distant = [], []
+    for limit in (lower, upper):
+        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
+            lines.append(float(limit))
+            low, high = min(low, limit), max(high, limit)
+        elif np.isfinite(limit):
+            distant.append(f"{limit:.3g}")
+    text = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}" if distant else ""
+    below, space = bool(high == upper), 0.1 * span if distant else 0.0
+    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
+    ends = low - margin - space * below, high + margin + space * (not below)
+    return LimitView(*ends, tuple(lines), text, below)
+
+
+def curve_samples(motion: Motion, kind: str) -> tuple[Array, Array | None]:
+    """Return times (K,), s, at which to draw a quantity of a motion, and its values (K, n); None if it is unknown."""
+    own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
+    times = np.union1d(np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times)
+    quantity = motion.quantity(kind)
+    return times, None if quantity is None else quantity.pieces.at(times)
 
 
 def draw_joints(
-    figure: Any, motions: Mapping[str, Motion], bounds: JointBounds, *, names: Sequence[str], units: Sequence[str]
+    figure: Any,
+    motions: Mapping[str, Motion],
+    bounds: JointBounds,
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    faults: Sequence[Fault] = (),
 ) -> None:
-    """Draw position, velocity and acceleration of every joint over time into an empty figure, with their limits.
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
 
     The first of several motions is the plan; the others are compared with it.
     """
@@ -52,17 +99,19 @@ def draw_joints(
                 (number, *curve_samples(motion, kind))
                 for number, motion in reversed([*enumerate(motions.values())])  # the plan last, on top
             ]
-            lower, upper = bounds_of(bounds, kind)
-            min_range = PICTURE_STYLE.flat * max(
-                (np.abs(values).max() for _, _, values in samples if values is not None), default=1.0
-            )
+            limit = getattr(bounds, kind, None)
+            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+            sizes = [np.abs(values).max() for _, _, values in samples if values is not None]
             grid[0, column].set_title(kind)
             for row, name in enumerate(names):
                 ax = grid[row, column]
                 for number, times, values in samples:
                     if values is not None:
                         ax.plot(times, values[:, row], **line_style(number))
-                draw_limits(ax, lower[row], upper[row], min_range)
+                for fault in faults:
+                    if (fault.name, fault.kind) == (name, kind) and fault.time is not None:
+                        ax.axvline(fault.time, color=FAULT, lw=2.0)
+                draw_limits(ax, lower[row], upper[row], PICTURE_STYLE.flat * max(sizes, default=1.0))
                 ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
                 ax.margins(x=0.01)
         for ax in grid[-1]:
@@ -72,10 +121,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of curves: as dashed lines if they are near the curves, else as text.
-
-    Curves with a range smaller than `min_range` are drawn as constant.
-    """
+    """Draw the limits of curves, see `limits_in_view`."""
     view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range=min_range)
     for limit in view.lines:
         ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
@@ -103,6 +149,15 @@ def as_svg(figure: Any) -> str:
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
+
+
+def svg_of_joints(
+    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Fault]
+) -> str:
+    """Return an `svg` element with the curves of a motion, see `draw_joints`."""
+    figure = _figure(None, (PICTURE_STYLE.width, 0.4 + 1.15 * len(names)))
+    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
+    return as_svg(figure)
 
 
 class Picture(Figure):
@@ -161,29 +216,22 @@ def _motion_of(plan: Plan) -> Motion:
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
     """Return the joint motion of an object that is plotted for comparison with a plan, and its cost or None."""
     cost: float | None = None
+    joints = getattr(other, "names", names)
     if isinstance(other, Plan):
-        joints, motion, cost = other.names, _motion_of(other), other.cost
+        motion, cost = _motion_of(other), other.cost
     elif isinstance(other, LocalSolution):
-        joints, motion, cost = names, Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
+        motion, cost = Motion(other.t, other.joints, other.joint_rates), float(other.cost[-1])
     elif isinstance(other, AccelerationSolution):
-        samples = other.motion
-        joints, motion = (
-            names,
-            Motion(samples.t, samples.joints, samples.joint_velocities, samples.joint_accelerations),
-        )
+        each = other.motion
+        motion = Motion(each.t, each.joints, each.joint_velocities, each.joint_accelerations)
     elif isinstance(other, JointTrajectory):
-        joints, motion = other.names, Motion(other.t, other.positions, other.velocities, other.accelerations)
+        motion = Motion(other.t, other.positions, other.velocities, other.accelerations)
     else:
-        words = (
-            f"plot: {name!r} is a {type(other).__name__}; a plan can be compared with a plan, a result of resolve or "
-            "resolve_accelerations, or a JointTrajectory"
-        )
-        raise ProblemError(words, name="against", value=other)
+        words = f"plot: {name!r} is a {type(other).__name__}; a plan can be compared with a plan, a result of resolve "
+        raise ProblemError(f"{words}or resolve_accelerations, or a JointTrajectory", name="against", value=other)
     if joints != names or motion.q.shape[1] != len(names) or len(motion.t) < 2:
-        words = (
-            f"plot: {name!r} has joints {', '.join(joints)} at {len(motion.t)} times; the plan's: {', '.join(names)}"
-        )
-        raise ProblemError(words, name="against", value=joints, limit=names)
+        words = f"plot: {name!r} has joints {', '.join(joints)} at {len(motion.t)} times; the plan's: "
+        raise ProblemError(words + ", ".join(names), name="against", value=joints, limit=names)
     return motion, cost
 
 
@@ -252,17 +300,12 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(name: str, motion: Any) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution, or of base, joints and rates of a result of
-    `resolve`, by name; raise ProblemError for any other object, which `name` denotes.
-    """
+    """Return the number of entries of each state and control of a solution or of a result of `resolve`, by name."""
     if isinstance(motion, LocalSolution):
         return {entry: values.shape[1] for entry, values in _local(motion).items()}
     if not isinstance(motion, Solution):
-        words = (
-            f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result of "
-            "resolve"
-        )
-        raise ProblemError(words, name="against", value=motion)
+        words = f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result "
+        raise ProblemError(f"{words}of resolve", name="against", value=motion)
     return {entry: values.shape[1] for entry, values in {**motion.states, **motion.controls}.items()}
 
 
@@ -273,9 +316,8 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s) and values of a motion's states and controls by name, including both one-sided values at nodes.
-
-    States and controls of a phase are given over the interval of that phase.
+    """Return times (s), in the interval of its phase, and values of each state and control by name, with both one-sided
+    values at nodes.
     """
     if isinstance(motion, LocalSolution):
         return {name: (motion.t, values) for name, values in _local(motion).items()}
@@ -304,14 +346,12 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
 
 def _motions_by_name(against: Any) -> dict[str, Any]:
     """Return the motions that are compared with a plan or solution, keyed by name."""
-    if against is None:
-        return {}
     if isinstance(against, Mapping):
         named = {str(name): one for name, one in against.items()}
     elif isinstance(against, list | tuple):
         named = {f"other {number}": one for number, one in enumerate(against, 1)}
     else:
-        named = {"the other": against}
+        return {} if against is None else {"the other": against}
     if not named:
         words = f"plot: {against!r} has no motion to compare with; pass a motion, several, or None"
         raise ProblemError(words, name="against", value=against)

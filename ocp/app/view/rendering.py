@@ -7,8 +7,6 @@ Each pixel is the mean of several samples.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -26,27 +24,22 @@ class PictureStyle:
     """Style of rendered pictures and of plotted curves.
 
     Attributes:
-        size: Size of a rendered picture, pixels.
-        max_pixels: Largest number of pixels.
+        size, max_pixels: Size of a rendered picture, and its largest number of pixels.
         half_field_of_view: Half of the vertical field of view, rad.
         side_samples: Samples along each side of a pixel.
         batch_size: Samples that are processed together: their arrays fit into the cache of a processor.
         fading: Fraction of the smaller side of a picture within which the floor fades towards the edge.
         sun: Azimuth to the left of the camera's, and elevation, rad.
-        shadow_map: Samples along each side of the shadow map, relative to the pixels along the longer side of the
-            picture.
+        shadow_map: Samples along each side of the shadow map, relative to the pixels along the picture's longer side.
         shadow_blur: Offsets around a sample of the shadow map that are averaged.
         shadow_bias: Distance from a surface at which its shadow is looked up, in samples of the map.
-        behind: Distance from a solid surface, relative to the depth, below which a transparent one counts as behind it.
-        tube_sides: Number of sides of a round line.
-        line: Radius of a line, relative to the size of the scene.
+        behind: Distance from a solid surface, relative to the depth, below which a transparent one is behind it.
+        tube_sides, line: Number of sides of a round line, and its radius relative to the size of the scene.
         poses: Number of times at which the robot is shown.
         curve_points: Number of points of a curve.
-        limit_distance: Limits farther from a curve than this many of its ranges are given in words, to keep its shape
-            visible.
+        limit_distance: Limits farther from a curve than this many of its ranges are given in words.
         flat: Change of a curve, relative to the largest value of its quantity, below which it is a rounding error.
-        width: Width of a figure, inches.
-        columns: Number of columns in a figure of a solution.
+        width, columns: Width of a figure, inches, and number of columns in a figure of a solution.
         entries: Largest number of states and controls in a figure of a solution.
     """
 
@@ -152,13 +145,8 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Horizontal ground with a square grid, which fades with the distance from its centre.
-
-    Attributes:
-        height: Height above the origin of world, m.
-        middle: x and y of the centre, m.
-        radius: Distance from the centre at which the floor has faded, m.
-        grid: Distance between the lines of the grid, m.
+    """Horizontal ground at a height, m, with lines of a square grid, which fades within a radius, m, around its middle
+    (x, y), m.
     """
 
     height: float
@@ -177,13 +165,7 @@ def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """Return the surface of a round tube along a line through points, to draw a path.
-
-    Args:
-        points: Points of the centre line. Shape (k, 3), m.
-        radius: Radius of the tube, m.
-        color: Red, green, blue.
-    """
+    """Return the surface of a round tube of a radius, m, and a colour along a line through points (k, 3), m."""
     line = np.asarray(points, dtype=float)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-9 * max(float(np.ptp(line, axis=0).max()), 1e-12)
     line = line[np.append(True, steps)]
@@ -198,15 +180,15 @@ def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
         side /= np.linalg.norm(side)
         sides[k] = side
     count = PICTURE_STYLE.tube_sides
-    angle = np.arange(count) * (2 * np.pi / count)
-    offsets = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * np.cross(tangents, sides)[:, None]
-    rings, columns = (
-        tangent.ravel() for tangent in np.meshgrid(np.arange(len(line) - 1), np.arange(count), indexing="ij")
-    )
-    a, b = rings * count + columns, rings * count + (columns + 1) % count
+    angle = np.arange(count)[:, None] * (2 * np.pi / count)
+    offsets = np.cos(angle) * sides[:, None] + np.sin(angle) * np.cross(tangents, sides)[:, None]
+    corners = np.arange(len(line) * count).reshape(-1, count)
+    a, b = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    inner = a < a.size - count
+    a, b = a[inner], b[inner]
     faces = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
-    flat = offsets.reshape(-1, 3)
-    return Part("", (line[:, None] + radius * offsets).reshape(-1, 3), flat, faces, (*color, 1.0))
+    surface = (line[:, None] + radius * offsets).reshape(-1, 3)
+    return Part("", surface, offsets.reshape(-1, 3), faces, (*color, 1.0))
 
 
 def render(
@@ -247,18 +229,6 @@ def render(
     return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Return a picture (height, width, 3) as a PNG file, whose rows are stored as differences from the row above."""
-    height, width, _ = picture.shape
-    rows = np.full((height, 1 + 3 * width), 2, dtype=np.uint8)  # the filter "up" of the PNG specification
-    rows[:, 1:] = np.diff(picture.reshape(height, -1), axis=0, prepend=np.zeros((1, 3 * width), dtype=np.uint8))
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, red green blue
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Mesh:
     """Triangles in the world: corners and normals (n, 3), corner indices of faces (f, 3), and face colours (f, 3)."""
@@ -289,10 +259,8 @@ def _project(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
 def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
     """Return inverse depth and index of the nearest triangle at each pixel centre; -inf and -1 where there is none.
 
-    Args:
-        places: Corners of the triangles (f, 3, 2), in pixels from the upper left.
-        near: Inverse depths of the corners (f, 3), linear over a triangle.
-        size: Columns and rows of pixels, which are numbered row by row.
+    `places` (f, 3, 2) has the corners of the triangles in pixels from the upper left, `near` (f, 3) their inverse
+    depths, which are linear over a triangle. Pixels are numbered row by row.
     """
     width, height = size
     depth, number = np.full(height * width, -np.inf), np.full(height * width, -1, dtype=np.intp)
@@ -349,10 +317,9 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
         begin = end
 
 
-def _blocks(cells: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Yield the given numbers of picture samples in blocks of at most `batch_size`."""
-    size = PICTURE_STYLE.batch_size
-    return (cells[begin : begin + size] for begin in range(0, len(cells), size))
+def _blocks(cells: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the given numbers of picture samples in blocks of at most `batch_size`."""
+    return np.array_split(cells, len(cells) // PICTURE_STYLE.batch_size + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,16 +398,10 @@ def _shade(
     sun: _Sun | None = None,
     alpha: float = 1.0,
 ) -> None:
-    """Blend the colours of the triangles that are nearest at given samples into a picture.
+    """Blend the colours of the triangles that are nearest at given samples into a picture (M, 3).
 
-    Args:
-        picture: Red, green and blue of all samples. Shape (M, 3).
-        mesh: The triangles.
-        faces: Index of the nearest triangle at each sample. Shape (M,).
-        cells: Numbers of the samples to draw.
-        camera: The camera.
-        sun: The sun; None: the light comes from the camera and there are no shadows.
-        alpha: Opacity of the triangles.
+    `faces` (M,) has the index of the nearest triangle at each sample, and `cells` the numbers of the samples to draw.
+    Without a sun the light comes from the camera and there are no shadows. `alpha` is the opacity of the triangles.
     """
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     sides = b - a, c - a, camera.eye - a

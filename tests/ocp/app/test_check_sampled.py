@@ -17,7 +17,7 @@ from toppra.algorithm import TOPPRA
 from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
 from ocp.app import Check
-from ocp.app.check.interpolation import Motion
+from ocp.app.check.joint_limits import Motion
 from ocp.app.files import RawTrajectory
 from tests.ocp.app.motions import check_motion
 from tests.ocp.app.test_check_toppra import arm

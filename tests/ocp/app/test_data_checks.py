@@ -16,9 +16,8 @@ from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Sphe
 from ocp import Plan
 from ocp.app import Check, check_trajectory
 from ocp.app.check.data_checks import BASES
-from ocp.app.check.interpolation import Motion, PiecewisePolynomial, polynomial_maxima
-from ocp.app.check.joint_limits import integrate_base, torque_expression
-from ocp.app.check.kinematic_checks import prove_clearance, with_wide_limits
+from ocp.app.check.joint_limits import Motion, PiecewisePolynomial, polynomial_maxima
+from ocp.app.check.motion_checks import integrate_base, prove_clearance, torque_expression, with_wide_limits
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along

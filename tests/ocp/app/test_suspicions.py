@@ -14,8 +14,8 @@ import pytest
 from models import FixedBase, Robot
 from ocp.__main__ import main
 from ocp.app import Check
-from ocp.app.check.interpolation import Motion
-from ocp.app.check.kinematic_checks import exchanged_joints
+from ocp.app.check.data_checks import exchanged_joints
+from ocp.app.check.joint_limits import Motion
 from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
 from tests.ocp.app.motions import check_motion, write_table

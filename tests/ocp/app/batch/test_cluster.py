@@ -8,7 +8,6 @@ import socket
 import ssl
 import urllib.error
 import urllib.request
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from distributed.security import Security
 
 from ocp import ProblemError
 from ocp.app.batch import run_batch
-from ocp.app.batch.engine import Engine, EngineSettings, Job
-from ocp.app.batch.result_store import Payload
+from ocp.app.batch.engine import Engine, EngineSettings
 from tests.ocp.app.batch import functions
 from tests.ocp.app.batch.drivers import check_killed_cluster, cluster
 
@@ -102,32 +100,3 @@ def test_processes_that_the_caller_began_meanwhile_outlive_the_workers() -> None
     finally:
         mine.kill()
         mine.join()
-
-
-class SimulatedClient:
-    """A client of one worker whose tasks all take the same time, s, and end at once."""
-
-    def __init__(self, task_s: float) -> None:
-        self.status, self.task_s = "running", task_s
-
-    def nthreads(self) -> dict[str, int]:
-        return {"worker": 1}
-
-    def submit(self, run: Any, function: Any, jobs: list[Any], near: bool, limit_s: float, **_: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result([Payload({"seconds": self.task_s})] * min(len(jobs), 1 + int(limit_s / self.task_s)))
-        return future
-
-
-@pytest.mark.parametrize("task_s", [0.0007, 0.002, 0.013, 0.3])
-def test_tasks_that_are_sent_together_last_as_long_as_set_and_longer_ones_are_sent_alone(task_s: float) -> None:
-    chunk_s = EngineSettings().chunk
-    with Engine(functions.square, near=False, cluster=SimulatedClient(task_s)) as engine:
-        for _ in range(40):
-            assert engine.free_slots() == 1
-            jobs = [Job(str(k), "{}", None) for k in range(engine.share(10**6))]
-            engine.submit(jobs)
-            outcomes = engine.wait(1.0)
-            assert [outcome.key for outcome in outcomes] == [job.key for job in jobs]
-    assert len(jobs) == 1 or len(jobs) * task_s <= chunk_s
-    assert (len(jobs) + 1.1) * task_s > chunk_s
