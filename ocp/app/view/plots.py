@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from models.checks import Array
-from ocp.app.check.joint_limits import Fault, Motion
-from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
+from ocp.app.check.joint_limits import Motion
+from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
+from ocp.app.view.report import KINDS, bounds_of, curve_samples, limits_in_view
 from ocp.errors import ProblemError, require
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
@@ -34,61 +35,12 @@ STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False,
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
-KINDS = {"position": "", "velocity": "/s", "acceleration": "/s²"}
-"""Quantities of a joint that are drawn over time, and the suffix that turns rad or m into the unit of the quantity."""
-
-
-class LimitView(NamedTuple):
-    """Ends of the axis of a diagram, limits that are drawn as lines, and a text about distant ones at an edge."""
-
-    low: float
-    high: float
-    lines: tuple[float, ...]
-    text: str
-    text_below: bool
-
-
-def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_range: float) -> LimitView:
-    """Return how a diagram shows the limits of curves with values from `low` to `high`.
-
-    Limits near the curves are drawn as lines, limits far away are given as text, to keep the shape of the curves
-    visible. Curves with a range smaller than `min_range` are drawn as constant.
-    """
-    if not np.isfinite([low, high]).all():
-        low = high = 0.0
-    span = max(high - low, min_range) or 1.0
-    lines, distant = [], []
-    for limit in (lower, upper):
-        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
-            lines.append(float(limit))
-            low, high = min(low, limit), max(high, limit)
-        elif np.isfinite(limit):
-            distant.append(f"{limit:.3g}")
-    text = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}" if distant else ""
-    below, space = bool(high == upper), 0.1 * span if distant else 0.0
-    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
-    ends = low - margin - space * below, high + margin + space * (not below)
-    return LimitView(*ends, tuple(lines), text, below)
-
-
-def curve_samples(motion: Motion, kind: str) -> tuple[Array, Array | None]:
-    """Return times (K,), s, at which to draw a quantity of a motion, and its values (K, n); None if it is unknown."""
-    own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
-    times = np.union1d(np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times)
-    quantity = motion.quantity(kind)
-    return times, None if quantity is None else quantity.pieces.at(times)
 
 
 def draw_joints(
-    figure: Any,
-    motions: Mapping[str, Motion],
-    bounds: JointBounds,
-    *,
-    names: Sequence[str],
-    units: Sequence[str],
-    faults: Sequence[Fault] = (),
+    figure: Any, motions: Mapping[str, Motion], bounds: JointBounds, *, names: Sequence[str], units: Sequence[str]
 ) -> None:
-    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with their limits.
 
     The first of several motions is the plan; the others are compared with it.
     """
@@ -99,8 +51,7 @@ def draw_joints(
                 (number, *curve_samples(motion, kind))
                 for number, motion in reversed([*enumerate(motions.values())])  # the plan last, on top
             ]
-            limit = getattr(bounds, kind, None)
-            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+            lower, upper = bounds_of(bounds, kind)
             sizes = [np.abs(values).max() for _, _, values in samples if values is not None]
             grid[0, column].set_title(kind)
             for row, name in enumerate(names):
@@ -108,9 +59,6 @@ def draw_joints(
                 for number, times, values in samples:
                     if values is not None:
                         ax.plot(times, values[:, row], **line_style(number))
-                for fault in faults:
-                    if (fault.name, fault.kind) == (name, kind) and fault.time is not None:
-                        ax.axvline(fault.time, color=FAULT, lw=2.0)
                 draw_limits(ax, lower[row], upper[row], PICTURE_STYLE.flat * max(sizes, default=1.0))
                 ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
                 ax.margins(x=0.01)
@@ -149,15 +97,6 @@ def as_svg(figure: Any) -> str:
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
-
-
-def svg_of_joints(
-    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Fault]
-) -> str:
-    """Return an `svg` element with the curves of a motion, see `draw_joints`."""
-    figure = _figure(None, (PICTURE_STYLE.width, 0.4 + 1.15 * len(names)))
-    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
-    return as_svg(figure)
 
 
 class Picture(Figure):

@@ -7,6 +7,8 @@ Each pixel is the mean of several samples.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -227,6 +229,18 @@ def render(
     samples, sides = picture.reshape(height, side_samples, width, side_samples, 3), range(side_samples)
     pixels = sum(samples[:, i, :, j] for i in sides for j in sides) / np.float32(side_samples**2)
     return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (height, width, 3) as a PNG file, whose rows are stored as differences from the row above."""
+    height, width, _ = picture.shape
+    rows = np.full((height, 1 + 3 * width), 2, dtype=np.uint8)  # the filter "up" of the PNG specification
+    rows[:, 1:] = np.diff(picture.reshape(height, -1), axis=0, prepend=np.zeros((1, 3 * width), dtype=np.uint8))
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, red green blue
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,10 @@ The page loads nothing from another host.
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +18,8 @@ from models.checks import Array
 from ocp.app.check.joint_limits import Motion, Row, RowVerdict, interpolate
 from ocp.app.check.verdict import Check, audit_rows, verdict_of
 from ocp.app.view.appearance import (
+    FAULT,
+    LIMIT,
     PLAN,
     SCENE,
     TIP,
@@ -29,7 +30,7 @@ from ocp.app.view.appearance import (
     obstacles_of_shapes,
     part_of,
 )
-from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, parts_in_world, render, tube
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, encode_png, parts_in_world, render, tube
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -40,6 +41,8 @@ SHOWN_ROWS = 8
 """Number of rows of a table that are shown at once, if not more are near their limits."""
 NEAR_LIMIT = 0.9
 """Share of a limit from which a value counts as near it."""
+KINDS = {"position": "", "velocity": "/s", "acceleration": "/s²"}
+"""Quantities of a joint that are drawn over time, and the suffix that turns rad or m into the unit of the quantity."""
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -60,6 +63,8 @@ figcaption { font-size: .85rem; padding: .2rem .4rem } summary { cursor: pointer
 th, td { text-align: left; padding: .25rem .6rem; border-bottom: 1px solid var(--line); vertical-align: top }
 td:last-child { min-width: 14rem }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
+.curves text { font: 9.5px system-ui, sans-serif; text-anchor: end } .curves path { fill: none; stroke: #000 }
+.curves .middle { text-anchor: middle } .curves .title { font-size: 11px } .curves .limit { font-size: 8px }
 footer { margin-top: 3rem; font-size: .8rem; opacity: .7 }
 """
 
@@ -161,7 +166,7 @@ def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene
         (f"{check.samples} samples", f"{check.duration:.5g} s", f"{len(check.joints)} joints", f"{check.rule} between"),
         tuple(str(fault) for fault in check.faults),
         picture,
-        curves_of(motion, bounds, check, units),
+        draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
         (("Checked quantities", check.limited_rows),),
         (
             *(f"unlimited: {item}" for item in check.unlimited),
@@ -190,7 +195,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, *count),
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
-        curves_of(motion, bounds, check, units),
+        draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
         (
             ("The audit", tuple(audit_rows(audit))),
             (f"Samples every {period:g} s against the limits", check.limited_rows),
@@ -199,11 +204,119 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     )
 
 
-def curves_of(motion: Motion, bounds: JointBounds, check: Check, units: Sequence[str]) -> str:
-    """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults."""
-    from ocp.app.view.plots import svg_of_joints  # with matplotlib, which no other part of the command needs
+class LimitView(NamedTuple):
+    """Ends of the axis of a diagram, limits that are drawn as lines, and a text about distant ones at an edge."""
 
-    return svg_of_joints(motion, bounds, names=check.joints, units=units, faults=check.faults)
+    low: float
+    high: float
+    lines: tuple[float, ...]
+    text: str
+    text_below: bool
+
+
+def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_range: float) -> LimitView:
+    """Return how a diagram shows the limits of curves with values from `low` to `high`.
+
+    Limits near the curves are drawn as lines, limits far away are given as text, to keep the shape of the curves
+    visible. Curves with a range smaller than `min_range` are drawn as constant.
+    """
+    if not np.isfinite([low, high]).all():
+        low = high = 0.0
+    span = max(high - low, min_range) or 1.0
+    lines, distant = [], []
+    for limit in (lower, upper):
+        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
+            lines.append(float(limit))
+            low, high = min(low, limit), max(high, limit)
+        elif np.isfinite(limit):
+            distant.append(f"{limit:.3g}")
+    text = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}" if distant else ""
+    below, space = bool(high == upper), 0.1 * span if distant else 0.0
+    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
+    ends = low - margin - space * below, high + margin + space * (not below)
+    return LimitView(*ends, tuple(lines), text, below)
+
+
+def curve_samples(motion: Motion, kind: str) -> tuple[Array, Array | None]:
+    """Return times (K,), s, at which to draw a quantity of a motion, and its values (K, n); None if it is unknown."""
+    own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
+    times = np.union1d(np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times)
+    quantity = motion.quantity(kind)
+    return times, None if quantity is None else quantity.pieces.at(times)
+
+
+def bounds_of(bounds: JointBounds, kind: str) -> tuple[Array, Array]:
+    """Return the lower and upper limits of the joints for a quantity in KINDS. Shape (n,) each."""
+    limit = getattr(bounds, kind, None)
+    return (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+
+
+def draw_curves(
+    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
+) -> str:
+    """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults.
+
+    matplotlib is not used, because it takes longer to import than everything else in a report.
+    """
+    width, height, left, gap, top, pitch = 165.0, 92.0, 72.0, 56.0, 18.0, 108.0  # px: diagrams and what is around them
+    parts = []
+
+    def place_of(time: Any) -> Any:
+        """Return the horizontal position of a time (s) or of several in a diagram, px."""
+        return width * (time - motion.t[0]) / (motion.t[-1] - motion.t[0])
+
+    for column, (kind, per) in enumerate(KINDS.items()):
+        times, values = curve_samples(motion, kind)
+        lower, upper = bounds_of(bounds, kind)
+        min_range = PICTURE_STYLE.flat * (1.0 if values is None else float(np.abs(values).max()))
+        marks = [(place_of(time), f"{time:.6g}") for time in _round_numbers(motion.t[0], motion.t[-1])]
+        for row, name in enumerate(names):
+            curve = np.full(1, np.nan) if values is None else values[:, row]
+            view = limits_in_view(
+                float(curve.min()), float(curve.max()), float(lower[row]), float(upper[row]), min_range=min_range
+            )
+            scale = height / (view.high - view.low)
+            parts.append(f'<g transform="translate({left + column * (width + gap):g} {top + row * pitch:g})">')
+            ticks = [(height - scale * (value - view.low), f"{value:.6g}") for value in _round_numbers(*view[:2])]
+            axes = f"M0 0V{height:g}H{width:g}" + "".join(f"M0 {y:.1f}h-3" for y, _ in ticks)
+            parts.append(f'<path d="{axes}{"".join(f"M{place:.1f} {height:g}v3" for place, _ in marks)}"/>')
+            parts += [f'<text x="-5" y="{y + 3:.1f}">{text}</text>' for y, text in ticks]
+            for limit in view.lines:
+                y = height - scale * (limit - view.low)
+                parts.append(f'<path d="M0 {y:.1f}H{width:g}" style="stroke:{LIMIT};stroke-dasharray:5 2"/>')
+            for fault in faults:
+                if fault.name == name and fault.kind == kind and fault.time is not None:
+                    parts.append(
+                        f'<path d="M{place_of(fault.time):.1f} 0v{height:g}" style="stroke:{FAULT};stroke-width:2"/>'
+                    )
+            if values is not None:
+                points = np.column_stack([place_of(times), height - scale * (curve - view.low)]).tolist()
+                line = "L".join(f"{a:.1f} {b:.1f}" for a, b in points)
+                parts.append(f'<path d="M{line}" style="stroke:{PLAN};stroke-width:1.6"/>')
+            if view.text:
+                y = height - 4 if view.text_below else 7
+                parts.append(f'<text class="limit" x="{width:g}" y="{y:g}" fill="{LIMIT}">{view.text}</text>')
+            labels = [(14 - gap, f"{units[row]}{per}"), *([(12 - left, name)] if column == 0 else [])]
+            for place, text in labels:
+                turned = f'transform="translate({place:g} {height / 2:g}) rotate(-90)"'
+                parts.append(f'<text class="middle" {turned}>{escape(text)}</text>')
+            if row == 0:
+                parts.append(f'<text class="middle title" x="{width / 2:g}" y="-6">{kind}</text>')
+            if row == len(names) - 1:
+                parts += [
+                    f'<text class="middle" x="{place:.1f}" y="{height + 14:g}">{text}</text>' for place, text in marks
+                ]
+                parts.append(f'<text class="middle" x="{width / 2:g}" y="{height + 27:g}">time, s</text>')
+            parts.append("</g>")
+    size = f"0 0 {left + 3 * width + 2 * gap + 12:g} {top + len(names) * pitch + 16:g}"
+    return f'<svg class="curves" viewBox="{size}" xmlns="http://www.w3.org/2000/svg">{"".join(parts)}</svg>'
+
+
+def _round_numbers(low: float, high: float) -> list[float]:
+    """Return three to eight multiples of 1, 2 or 5 times a power of ten between two numbers, for the ticks of axes."""
+    power = 10.0 ** np.floor(np.log10((high - low) / 3))
+    step = power * max((factor for factor in (1, 2, 5) if factor * power <= (high - low) / 3), default=1)
+    return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
 def draw_scene(
@@ -213,9 +326,6 @@ def draw_scene(
 
     Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
     """
-    from matplotlib.colors import to_rgb
-    from matplotlib.image import imsave
-
     times = np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points)
     base = None if bases is None else interpolate(times, motion.t, bases)
     frames = frames_along(machine, motion.position.at(times), base)
@@ -230,7 +340,7 @@ def draw_scene(
         corners, faces = obstacle.solid(robot_points)
         if obstacle.rotations is not None and obstacle.positions is not None:
             corners = corners @ obstacle.rotations[-1].T + obstacle.positions[-1]
-        static.append(part_of("", corners, faces, (*to_rgb(SCENE), 1.0)))
+        static.append(part_of("", corners, faces, (*_rgb(SCENE), 1.0)))
         if obstacle.normal is None:
             points.append(corners)
     if machine.robot.tip is not None:
@@ -239,10 +349,14 @@ def draw_scene(
     low, high = all_points.min(axis=0), all_points.max(axis=0)
     size = float((high - low).max())
     if machine.robot.tip is not None:
-        static.append(tube(frames.tip, PICTURE_STYLE.line * size, to_rgb(TIP)))
-    transparent = [Layer(parts, 0.12 + 0.08 * k, to_rgb(PLAN)) for k, parts in enumerate(poses[:-1])]
+        static.append(tube(frames.tip, PICTURE_STYLE.line * size, _rgb(TIP)))
+    transparent = [Layer(parts, 0.12 + 0.08 * k, _rgb(PLAN)) for k, parts in enumerate(poses[:-1])]
     floor = None if machine.base_size else Floor(low[2], tuple((low + high)[:2] / 2), 1.1 * size, 0.1)
     layers = [Layer(poses[-1]), Layer(static), *transparent]
-    stream = io.BytesIO()
-    imsave(stream, render(layers, Camera.around(all_points, PICTURE_STYLE.size), floor=floor), format="png")
-    return stream.getvalue()
+    return encode_png(render(layers, Camera.around(all_points, PICTURE_STYLE.size), floor=floor))
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    """Return red, green and blue, 0 to 1, of a colour in the form #RRGGBB."""
+    red, green, blue = bytes.fromhex(color[1:])
+    return red / 255, green / 255, blue / 255

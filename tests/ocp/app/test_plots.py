@@ -29,9 +29,10 @@ from ocp import (
     resolve,
     solve,
 )
-from ocp.app.check.joint_limits import Fault, Motion
+from ocp.app.check.data_checks import Fault
+from ocp.app.check.joint_limits import Motion
 from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
-from ocp.app.view.plots import draw_joints, svg_of_joints
+from ocp.app.view.report import draw_curves
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.plan import Candidate, Reason, Rejection
 from ocp.motion.result.candidate import Stage
@@ -310,25 +311,37 @@ def test_the_table_of_a_solution_has_a_column_for_every_entry() -> None:
     np.testing.assert_array_equal(table["v[1]"], sprint()["v"][:, 1])
 
 
-def test_curves_of_a_report_are_those_of_the_motion_with_its_limits_and_faults() -> None:
+def test_curves_of_a_report_pass_through_the_motion_in_the_scale_of_their_axes() -> None:
     t = np.linspace(2.0, 5.0, 31)
     moving = Motion(t, np.sin(t)[:, None], np.cos(t)[:, None])
     free = np.array([np.inf])
     bounds = Limits().bounds(arm())._replace(lower=np.array([-1.2]), upper=np.array([40.0]), velocity=free)
     fault = Fault("velocity", "a<b", "too fast", time=3.5)
-    options: Any = {"names": ["a<b"], "units": ["rad"], "faults": [fault]}
-    figure = Figure()
-    draw_joints(figure, {"": moving}, bounds, **options)
-    for ax, kind in zip(figure.axes, ("position", "velocity", "acceleration"), strict=True):
+    root = ElementTree.fromstring(draw_curves(moving, bounds, names=["a<b"], units=["rad"], faults=[fault]))
+    tag = "{http://www.w3.org/2000/svg}"
+    diagrams = root.findall(f"{tag}g")
+    assert len(diagrams) == 3
+    for diagram, kind in zip(diagrams, ("position", "velocity", "acceleration"), strict=True):
+        texts = diagram.findall(f"{tag}text")
+        rows = [(float(one.attrib["y"]) - 3, float(str(one.text))) for one in texts if one.attrib.get("x") == "-5"]
+        marks = [one for one in texts if one.attrib.get("y") == "106"]
+        columns = [(float(one.attrib["x"]), float(str(one.text))) for one in marks]
+        assert 3 <= len(rows) <= 8
+        value_of, time_of = (
+            np.poly1d(np.polyfit([place for place, _ in one], [value for _, value in one], 1))
+            for one in (rows, columns)
+        )
+        paths = {one.attrib.get("style", "")[7:14]: one.attrib["d"] for one in diagram.findall(f"{tag}path")}
+        points = np.array([one.split() for one in paths[PLAN][1:].split("L")], dtype=float)
         quantity = moving.quantity(kind)
         assert quantity is not None
-        (line,) = curves(ax, PLAN)
-        times, values = line.get_data()
-        assert (times[0], times[-1]) == (2.0, 5.0)
-        np.testing.assert_allclose(values, quantity.pieces.at(times)[:, 0])
-        assert ("a<b" in ax.get_ylabel()) == (kind == "position")
-        assert [text.get_text() for text in ax.texts] == (["limit 40"] if kind == "position" else [])
-        assert [one.get_ydata()[0] for one in curves(ax, LIMIT)] == ([-1.2] if kind == "position" else [])
-        assert [one.get_xdata()[0] for one in curves(ax, FAULT)] == ([3.5] if kind == "velocity" else [])
-    root = ElementTree.fromstring(svg_of_joints(moving, bounds, **options))
-    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+        curve = quantity.pieces.at(np.clip(time_of(points[:, 0]), 2.0, 5.0))[:, 0]
+        np.testing.assert_allclose(value_of(points[:, 1]), curve, atol=0.02 * np.ptp(curve))
+        words = " ".join(str(one.text) for one in texts)
+        assert ("a<b" in words) == (kind == "position")
+        assert ("limit 40" in words) == (kind == "position")
+        if kind == "position":
+            assert value_of(float(paths[LIMIT].split()[1].partition("H")[0])) == pytest.approx(-1.2, abs=0.02)
+        if kind == "velocity":
+            assert time_of(float(paths[FAULT][1:].split()[0])) == pytest.approx(3.5, abs=0.01)
+        assert (FAULT in paths) == (kind == "velocity")

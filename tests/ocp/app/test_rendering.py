@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from models.checks import Array
 from ocp import ProblemError
 from ocp.app.view.appearance import Part, part_of
-from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, render, tube
+from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, encode_png, render, tube
 
+RNG = np.random.default_rng(17)
 PURE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -164,3 +168,10 @@ def test_pictures_of_no_or_of_vast_size_are_refused(size: tuple[int, int]) -> No
     with pytest.raises(ProblemError, match="pixels") as refused:
         Camera.around(np.zeros((1, 3)), size)
     assert refused.value.name == "size"
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (64, 96, 3)])
+def test_a_written_picture_is_read_back_by_another_library(shape: tuple[int, ...]) -> None:
+    picture = RNG.integers(0, 256, size=shape, dtype=np.uint8)
+    read = imread(io.BytesIO(encode_png(picture)), format="png")
+    np.testing.assert_array_equal(np.round(255 * read), picture)
