@@ -308,14 +308,14 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the smaller of two bodies' gaps along a direction at start and end of an interval. Shape (K,), m.
+        """Return the smallest of two bodies' gaps along a direction at the given samples. Shape (K,), m.
 
-        The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
+        The same row must separate the bodies at all samples; otherwise nothing follows for the times between.
         """
         gap = np.empty(len(facing.row))
         for kind, chosen, row in self._by_kind(facing.row):
             along, place = facing.along[chosen], facing.place[chosen]
-            gap[chosen] = np.minimum(*(kind.gaps(along, frames, at[place], row) for at in ends))
+            gap[chosen] = np.min([kind.gaps(along, frames, at[place], row) for at in ends], axis=0)
         return np.asarray(gap[self._covered.decisive(facing.place, gap, len(ends[0]))])
 
     @staticmethod

@@ -94,7 +94,7 @@ def near_pairs(
         scene: Collision scene of a machine on a fixed base.
         joints: Configurations. Shape (M, n).
         reach: Largest distance beyond the clearance, m.
-        gradients: Whether gradients are computed, by finite differences; they are 0 otherwise.
+        gradients: Whether gradients are computed; they are 0 otherwise.
 
     Returns:
         Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient, shape
@@ -112,10 +112,13 @@ def near_pairs(
     at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
     gradient = np.zeros((len(at), n))
     if gradients and len(at):
+        # a distance is the largest gap along any direction: its derivative is that of the gap along the maximiser
         rows, index = np.unique(at, return_inverse=True)
-        moved = frames_at((joints[rows, None] + SLIDING.difference * np.eye(n)).reshape(-1, n))
-        places = (n * index[:, None] + np.arange(n)).ravel()
-        gradient = (bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / SLIDING.difference
+        facing = bodies.nearest(frames, at, pair)[0]
+        gap_now = bodies.chords(facing, frames, (at,))
+        for joint, change in enumerate(SLIDING.difference * np.eye(n)):
+            moved = bodies.chords(facing, frames_at(joints[rows] + change), (index,))
+            gradient[:, joint] = (moved - gap_now) / SLIDING.difference
     return at, pair, gap - scene.clearance, gradient
 
 
