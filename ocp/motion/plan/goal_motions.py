@@ -192,7 +192,7 @@ def _constant_speed_candidates(task: GoalTask, paths: list[JointPath]) -> list[C
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidates along joint paths: at constant speed, unless limits of actuators determine the timing."""
+    """Return audited candidates along joint paths, at constant speed unless actuator limits determine the timing."""
     return _candidates_within_limits(task, paths) if task.is_dynamic else _constant_speed_candidates(task, paths)
 
 

@@ -186,16 +186,15 @@ def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
     search = TreeSearch(task.motions, np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper), task.scale)
-    share, chosen = request.settings.search_share, {"seed": request.seed, "settings": request.settings.search}
+    share = request.settings.search_share
+    chosen: dict[str, Any] = {"seed": request.seed, "settings": request.settings.search}
     reason, name, found = "in all random searches", "search", False
     try:
         if task.is_fastest:
             paths = search_paths(search, task.start, task.goals, **chosen)
         else:
             with request.limited(share * seconds):
-                paths = iter(
-                    find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **chosen)
-                )
+                paths = iter(find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **chosen))
         while True:
             with request.limited(share * time_left()):
                 path = next(paths, None)

@@ -327,7 +327,7 @@ class _Search:
         inner = max(round(rest * settings.intervals), 1)
         lengths = np.concatenate([short, np.full(inner, rest / inner), short[::-1]])
         breaks = np.append(0.0, np.cumsum(lengths)) / sum(lengths)
-        slowest = least_durations(np.abs(self.end - self.start), bounds).argmax(keepdims=True)
+        slowest = [int(least_durations(np.abs(self.end - self.start), bounds).argmax())]
         if self.horizon is None and self.start[slowest] != self.end[slowest]:
             own = JointBounds(*(limit[slowest] for limit in bounds))
             phases = synchronised_motion(self.start[slowest], self.end[slowest], own).durations

@@ -145,7 +145,9 @@ def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:
-    with pytest.raises(ProblemError, match=r"give one table \[path\], \[goal\], \[waypoints\] or \[walk\]") as caught:
+    with pytest.raises(
+        ProblemError, match=r"give one of the tables \[path\], \[goal\], \[waypoints\], \[walk\], \[capture\]"
+    ) as caught:
         read(tmp_path, "[search]\nseed = 1\n")
     assert caught.value.name == "path"
 
