@@ -293,9 +293,8 @@ def _machine(entries: TomlTable, folder: Path, base: str = "fixed") -> Machine:
 
 def _loaded(entries: TomlTable, robot: Robot) -> Robot:
     """Return the robot with the load, kg, that a table gives at the tip."""
-    if (load := entries.positive("load", "kg")) is None:
-        return robot
-    return _located(entries, "load", models.with_load, robot, robot.tip_link, load, robot.tip_translation)
+    load, place = entries.positive("load", "kg"), (robot.tip_link, robot.tip_translation)
+    return robot if load is None else _located(entries, "load", models.with_load, robot, place[0], load, place[1])
 
 
 def _tasks(root: TomlTable, folder: Path, machine: Machine) -> Any:
@@ -429,7 +428,9 @@ def _capture(entries: TomlTable, folder: Path, machine: Machine) -> Capture:
     target = _machine(body, folder, "planar" if machine.base == "planar" else "floating")
     pose = body.vector("pose", target.base_size, f"{target.base_size} numbers: the pose of the body at the start")
     body.done()
-    return entries.build(Capture, CAPTURE, target=target, target_base=pose)
+    return entries.build(
+        Capture, CAPTURE, target=replace(target, robot=models.simplify(target.robot)), target_base=pose
+    )
 
 
 MOTIONS: dict[str, Callable[[TomlTable, Path, Machine], Any]] = {
@@ -445,10 +446,8 @@ MOTIONS: dict[str, Callable[[TomlTable, Path, Machine], Any]] = {
 def _search(entries: TomlTable) -> dict[str, Any]:
     """Read the table [search] of a task file and return its entries as options of the planner."""
     kind = entries.choice("kind", ("configurations", "start", "global", "segments"), "configurations")
-    if isinstance(entries.raw("horizon"), str):
-        horizon = entries.choice("horizon", ("free",))
-    else:
-        horizon = entries.positive("horizon", 's, or "free"')
+    is_free = isinstance(entries.raw("horizon"), str)
+    horizon = entries.choice("horizon", ("free",)) if is_free else entries.positive("horizon", 's, or "free"')
     options: dict[str, Any] = {"search": kind, "horizon": horizon, **entries.values(SEARCH)}
     if kind == "segments" and options.get("cyclic"):
         raise entries.error("cyclic", 'kind = "segments" does not support cyclic; remove it')
