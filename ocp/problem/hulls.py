@@ -38,6 +38,7 @@ class Hull:
         core: Points in that frame. Shape (m, 3), m.
         radius: Radius by which the hull is inflated, m.
         normal: Outward unit normal of a half-space, whose core is one point of its plane; shape (0,) for a hull.
+        link: Name of what carries the body, such as a link of a robot.
 
     Raises:
         ProblemError: Wrong shapes, a value that is not finite, a negative radius, a normal that is not a unit vector.
@@ -47,6 +48,7 @@ class Hull:
     core: np.ndarray
     radius: float = 0.0
     normal: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    link: str = ""
 
     def __post_init__(self) -> None:
         core, normal = table("hull: core", self.core), table("hull: normal", self.normal)
@@ -432,6 +434,11 @@ class Separation:
     def __len__(self) -> int:
         """Return the number of pairs of bodies."""
         return len(self.pairs)
+
+    @property
+    def bodies(self) -> tuple[Hull, ...]:
+        """The bodies, in the order of their indices."""
+        return tuple(self.hulls.values())
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:

@@ -428,9 +428,8 @@ def _capture(entries: TomlTable, folder: Path, machine: Machine) -> Capture:
     target = _machine(body, folder, "planar" if machine.base == "planar" else "floating")
     pose = body.vector("pose", target.base_size, f"{target.base_size} numbers: the pose of the body at the start")
     body.done()
-    return entries.build(
-        Capture, CAPTURE, target=replace(target, robot=models.simplify(target.robot)), target_base=pose
-    )
+    target = replace(target, robot=models.simplify(target.robot))  # type: ignore[type-var]
+    return entries.build(Capture, CAPTURE, target=target, target_base=pose)
 
 
 MOTIONS: dict[str, Callable[[TomlTable, Path, Machine], Any]] = {

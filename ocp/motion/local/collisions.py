@@ -50,7 +50,7 @@ def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
     """Return the shapes of the bodies and obstacles of a collision scene as convex hulls, by name."""
     return {
         body.name: Hull(
-            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0))
+            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0)), body.link
         )
         for body in scene.bodies
     }

@@ -187,25 +187,25 @@ def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
     search = TreeSearch(task.motions, np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper), task.scale)
     share = request.settings.search_share
-    chosen: dict[str, Any] = {"seed": request.seed, "settings": request.settings.search}
-    reason, name, found = "in all random searches", "search", False
+    shared: dict[str, Any] = {"seed": request.seed, "settings": request.settings.search}
+    reason, name, has_path = "in all random searches", "search", False
     try:
         if task.is_fastest:
-            paths = search_paths(search, task.start, task.goals, **chosen)
+            paths = search_paths(search, task.start, task.goals, **shared)
         else:
             with request.limited(share * seconds):
-                paths = iter(find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **chosen))
+                paths = iter(find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **shared))
         while True:
             with request.limited(share * time_left()):
                 path = next(paths, None)
             if path is None:
                 break
             report(f"a path of length {path.length:.4g}")
-            found = True
+            has_path = True
             yield path
     except TimeLimitReached:
         reason, name = f"within the time limit of {seconds:.4g} s", "time_limit"
-    if found:
+    if has_path:
         return
     goal = task.goals[np.linalg.norm((task.goals - task.start) * task.scale, axis=1).argmin()]
     places = task.start + np.linspace(0.0, 1.0, request.settings.guess_times)[:, None] * (goal - task.start)

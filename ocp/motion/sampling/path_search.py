@@ -238,15 +238,15 @@ def search_paths(
     yield from straight[: settings.most_paths]
     if straight and straight[0].length <= min(path.length for path in paths):
         return
-    number, last, samples, found = 0, settings.attempts, settings.first, bool(straight)
+    number, last, samples, has_path = 0, settings.attempts, settings.first, bool(straight)
     while number < last:
         random = np.random.default_rng([seed, number])
         joints = connect(search, start, goals, random=random, most_samples=samples)
         number += 1
         if joints is not None:
-            found, last = True, min(last, number + settings.classes)
+            has_path, last = True, min(last, number + settings.classes)
             yield _path_of(search, shorten(motions, joints, search.scale, random=random), goals)
-        if not found and number % 2 == 0:
+        if not has_path and number % 2 == 0:
             samples *= 2
 
 

@@ -33,7 +33,7 @@ import numpy as np
 import scipy
 
 from models.checks import Array
-from ocp.console import TimeLimitReached, casadi_silenced, check_time
+from ocp.console import casadi_silenced, check_time, time_left
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import (
     ConstantJerkMotion,
@@ -192,12 +192,9 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
     best: _State | None = state if state.is_feasible else None
     idle = 0
     for _ in range(settings.most_steps):
-        try:
-            check_time()
-        except TimeLimitReached:
-            if best is None:
-                raise
+        if best is not None and time_left() <= 0:
             break
+        check_time()
         step = search.step(state, region)
         if step is not None and state.is_feasible and step.gain < least_gain:
             break
@@ -274,10 +271,9 @@ class _Search:
         bounds = limits.bounds
         self.start, self.end, self.size = path[0], path[-1], path.shape[1]
         self.degree = 3 if np.isfinite(bounds.jerk).any() or cost.squares[2].any() else 2
-        spread = np.ptp(path, axis=0).max()
         self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
         self.has_rate_limit = np.isfinite(bounds.velocity)
-        self.spread = np.where(self.has_rate_limit, 0.0, spread)
+        self.spread = np.where(self.has_rate_limit, 0.0, np.ptp(path, axis=0).max())
         self.breaks = self._breaks(path)
         self.knots = np.concatenate([np.zeros(self.degree), self.breaks, np.ones(self.degree)])
         self.count = len(self.breaks) - 1 + self.degree
@@ -319,10 +315,9 @@ class _Search:
             least = np.where(self.has_rate_limit, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
             least = least if self.horizon is None else self.horizon
         first = min(max(build_up / least if least > 0 else 0.0, settings.shortest), 1 / settings.intervals)
-        short = [first]
-        while self.degree == 3 and short[-1] * settings.growth < 1 / settings.intervals:
+        short = [first] if self.degree == 3 else []
+        while short and short[-1] * settings.growth < 1 / settings.intervals:
             short.append(short[-1] * settings.growth)
-        short = short if self.degree == 3 else []
         rest = 1 - 2 * sum(short)
         inner = max(round(rest * settings.intervals), 1)
         lengths = np.concatenate([short, np.full(inner, rest / inner), short[::-1]])
@@ -380,10 +375,9 @@ class _Search:
 
     def evaluate(self, points: Array, duration: float) -> _State:
         """Evaluate and linearise the constraints of a motion, given its free control points and its duration."""
-        inner = points.ravel()[self.free]
-        points = (self.fixed + duration * self.moving).ravel()
-        points[self.free] = inner
-        points = points.reshape(self.count, self.size)
+        fixed = (self.fixed + duration * self.moving).ravel()
+        fixed[self.free] = points.ravel()[self.free]
+        points = fixed.reshape(self.count, self.size)
         parts = [*self._derivative_rows(points, duration), self._clearance_rows(points)]
         if len(self.limits.torques.limited):
             parts += self._torque_rows(points, duration)
@@ -470,8 +464,8 @@ class _Search:
         change = solution["x"].full().ravel()
         moved = state.points.ravel().copy()
         moved[self.free] += change[:count]
-        duration = state.duration * (1 + change[count])
-        return _Step(moved.reshape(self.count, self.size), duration, -float(solution["cost"]))
+        points, duration = moved.reshape(self.count, self.size), state.duration * (1 + change[count])
+        return _Step(points, duration, -float(solution["cost"]))
 
     def _cost_model(self, state: _State) -> tuple[ca.DM, Array]:
         """Return the Hessian and gradient of the relative cost in free control points, log duration and slack."""
