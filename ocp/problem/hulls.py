@@ -18,7 +18,7 @@ frames that depend on time alone follow from their expressions (:mod:`ocp.proble
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -56,9 +56,8 @@ class Hull:
             raise ProblemError(f"hull: core has shape {core.shape}, expected (m, 3)", name="core", value=core.shape)
         check_finite("hull: core", core)
         if not (np.isfinite(self.radius) and self.radius >= 0):
-            raise ProblemError(
-                f"hull: radius {self.radius!r} m is not finite and >= 0", name="radius", value=self.radius
-            )
+            words = f"hull: radius {self.radius!r} m is not finite and >= 0"
+            raise ProblemError(words, name="radius", value=self.radius)
         if normal.size and (normal.shape != (3,) or not abs(np.linalg.norm(normal) - 1) < 1e-9):
             words = f"hull: normal {normal.tolist()} is not a unit vector of three entries"
             raise ProblemError(words, name="normal", value=normal.tolist())
@@ -451,9 +450,7 @@ class Separation:
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
-        return Separation(
-            self.name, self.placements, self.hulls, movers=self.movers, covers=covers, assumed=self.assumed, **parts
-        )
+        return replace(self, covers=covers, **parts)
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
