@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -31,7 +32,7 @@ from ocp.motion.plan.goal_motions import (
 )
 from ocp.motion.result.candidate import Candidate, Reason, Rejection
 from ocp.motion.result.solved_plan import Part, SolvedPlan
-from ocp.motion.sampling.joint_paths import StraightMotions, same_class
+from ocp.motion.sampling.joint_paths import StraightMotions, optimise_length
 from ocp.motion.sampling.path_search import JointPath, TreeSearch, find_paths, search_paths
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
@@ -75,11 +76,16 @@ def _find_candidates(task: GoalTask, seconds: float) -> list[Candidate]:
             return motions_along(task, list(_find_paths(task, seconds)))
         paths = list[JointPath]()
         for path in _find_paths(task, seconds):
-            if not any(same_class(task.motions, path.joints, other.joints, task.scale) for other in paths):
-                paths.append(path)
-                candidates.append(fastest_candidate(task, path))
+            paths.append(path)
+            candidates.append(fastest_candidate(task, path))
             if attains_bound(task, candidates[-1]):
-                break
+                return candidates
+        shortest = min(paths, key=lambda path: path.length)
+        if len(shortest.joints) > 2:
+            with task.request.limited(settings.search_share * time_left()):
+                limits = task.bounds.lower, task.bounds.upper
+                joints = optimise_length(task.motions, shortest.joints, task.scale, limits=limits)
+            candidates.append(fastest_candidate(task, replace(shortest, joints=joints)))
     except (SolveError, TimeLimitReached):
         if not any(candidate.passed for candidate in candidates):
             raise

@@ -184,8 +184,8 @@ def optimal_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    If no motion is feasible, return the last one. The sequence ends when a program predicts that the cost decreases by
-    less than `least_gain`, or when it does so in two steps.
+    If no motion is feasible, return the last one. The sequence ends when a program predicts that a step within the first
+    trust region decreases the cost by less than `least_gain`, or when two steps do.
     """
     settings = search.settings
     penalty = settings.penalty if search.horizon is None else settings.violation
@@ -196,8 +196,8 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
             break
         check_time()
         step = search.step(state, region)
-        if step is not None and state.is_feasible and step.gain < least_gain:
-            break
+        if step is not None and state.is_feasible and step.gain * max(1.0, settings.first / region) < least_gain:
+            break  # the predicted gain is a concave function of the trust region
         trial = None if step is None else search.evaluate(step.points, step.duration)
         gain = 0.0 if trial is None else state.merit(penalty) - trial.merit(penalty)
         if trial is None or gain <= 0:
