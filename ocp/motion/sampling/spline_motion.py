@@ -184,7 +184,7 @@ def optimal_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    If no motion is feasible, return the last one. The sequence ends when a program predicts that a step within the first
+    If no motion is feasible, return the last one. The sequence ends when a program predicts that a step in the first
     trust region decreases the cost by less than `least_gain`, or when two steps do.
     """
     settings = search.settings
