@@ -155,7 +155,7 @@ class CandidateQueue:
         while self._heap:
             candidate = heappop(self._heap)[-1]
             report(self._state, step=True)
-            if self.exhausted and candidate.stage < Stage.REFINED:  # those that are solved are completed
+            if self.exhausted:
                 words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
                 self.candidates.append(candidate.with_rejection(Reason(Rejection.NOT_TRIED, words)))
             elif (motion := self._find_motion(candidate)) is not None:
