@@ -185,14 +185,15 @@ class CollisionScene:
         bodies = []
         for k, (link, body) in enumerate(zip(links, own, strict=True)):
             name = link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}"
-            bodies.append(PlacedShape(name, body.shape, indices[link]))
+            bodies.append(PlacedShape(name, body.shape, indices[link], link))
         moving = 0
         for number, obstacle in enumerate(self.obstacles):
+            name = f"obstacle {number}"
             if isinstance(obstacle, MovingObstacle):
-                bodies.append(PlacedShape(f"obstacle {number}", obstacle.shape, len(indices) + moving))
+                bodies.append(PlacedShape(name, obstacle.shape, len(indices) + moving, name))
                 moving += 1
             else:
-                bodies.append(PlacedShape(f"obstacle {number}", obstacle, WORLD))
+                bodies.append(PlacedShape(name, obstacle, WORLD, name))
         pairs = [(i, j, indices[self._reference_link(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
         cover_pairs: dict[int, tuple[tuple[int, int], ...]] = {}
         covers: dict[int, Array] = {}
@@ -202,8 +203,8 @@ class CollisionScene:
             for geometry, k in zip(geometries, replaced_pairs[0], strict=True):
                 if isinstance(geometry, LinkMesh) and geometry not in hulls:
                     hulls[geometry] = len(bodies)
-                    name = f"{own[k].link} hull {len(hulls)}"
-                    bodies.append(PlacedShape(name, geometry.hull, indices[own[k].link]))
+                    link = own[k].link
+                    bodies.append(PlacedShape(f"{link} hull {len(hulls)}", geometry.hull, indices[link], link))
                 sides.append(hulls[geometry] if isinstance(geometry, LinkMesh) else k)
                 covering.append([n for n, body in enumerate(own) if geometry in (body, body.mesh)])
             first, second = (own[k] for k in replaced_pairs[0])
@@ -229,10 +230,8 @@ class CollisionScene:
 
     def pair_names(self, pair: int) -> tuple[str, str]:
         """Return the names of the two bodies of a checked pair: of two links, or of a link and an obstacle."""
-        bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
-        own = range(len(self._carriers))
-        first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
-        return first, second
+        first, second, _ = self.pairs[pair]
+        return self.bodies[first].link, self.bodies[second].link
 
     @property
     def disabled(self) -> list[tuple[str, str]]:

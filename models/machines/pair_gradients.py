@@ -32,11 +32,13 @@ class PlacedShape(NamedTuple):
         name: Name of its link, with a number if the link has several shapes, or of an obstacle.
         shape: Shape in the frame that carries it.
         frame: Index of that frame among those of `CollisionScene.placements`; -1 for the world.
+        link: Name of the link that carries the shape, or of the obstacle.
     """
 
     name: str
     shape: Shape
     frame: int
+    link: str
 
 
 def distance_gradients(

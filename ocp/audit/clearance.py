@@ -270,7 +270,7 @@ class _Search:
         for level in range(self.top):
             rates, seconds = (_pairwise_maximum(values) for values in self.fastest[level])
             self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
-        self.bodies = BodyPairs(tuple(apart.hulls.values()), apart.pairs, apart.covers)
+        self.bodies = BodyPairs(apart.bodies, apart.pairs, apart.covers)
         n = len(apart)
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 

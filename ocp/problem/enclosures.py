@@ -221,7 +221,7 @@ class PrescribedMotion:
         frames = [k for k, part in enumerate(parts) if ca.depends_on(part, time)]
         rows = [_as_function_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
         self._enclosures = Enclosures(ca.vertcat(*rows), time, what) if rows else None
-        hulls = list(separation.hulls.values())
+        hulls = separation.bodies
         covered = CoveredPairs(separation.pairs, separation.covers)
         for first, second, seen in covered.rows:
             if seen != WORLD and {seen, hulls[first].frame, hulls[second].frame} & set(frames):

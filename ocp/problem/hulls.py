@@ -18,7 +18,7 @@ frames that depend on time alone follow from their expressions (:mod:`ocp.proble
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ class Hull:
         core: Points in that frame. Shape (m, 3), m.
         radius: Radius by which the hull is inflated, m.
         normal: Outward unit normal of a half-space, whose core is one point of its plane; shape (0,) for a hull.
+        link: Name of what carries the body, such as a link of a robot.
 
     Raises:
         ProblemError: Wrong shapes, a value that is not finite, a negative radius, a normal that is not a unit vector.
@@ -47,6 +48,7 @@ class Hull:
     core: np.ndarray
     radius: float = 0.0
     normal: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    link: str = ""
 
     def __post_init__(self) -> None:
         core, normal = table("hull: core", self.core), table("hull: normal", self.normal)
@@ -54,9 +56,8 @@ class Hull:
             raise ProblemError(f"hull: core has shape {core.shape}, expected (m, 3)", name="core", value=core.shape)
         check_finite("hull: core", core)
         if not (np.isfinite(self.radius) and self.radius >= 0):
-            raise ProblemError(
-                f"hull: radius {self.radius!r} m is not finite and >= 0", name="radius", value=self.radius
-            )
+            words = f"hull: radius {self.radius!r} m is not finite and >= 0"
+            raise ProblemError(words, name="radius", value=self.radius)
         if normal.size and (normal.shape != (3,) or not abs(np.linalg.norm(normal) - 1) < 1e-9):
             words = f"hull: normal {normal.tolist()} is not a unit vector of three entries"
             raise ProblemError(words, name="normal", value=normal.tolist())
@@ -308,14 +309,14 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the smaller of two bodies' gaps along a direction at start and end of an interval. Shape (K,), m.
+        """Return the smallest of two bodies' gaps along a direction at the given samples. Shape (K,), m.
 
-        The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
+        The same row must separate the bodies at all samples; otherwise nothing follows for the times between.
         """
         gap = np.empty(len(facing.row))
         for kind, chosen, row in self._by_kind(facing.row):
             along, place = facing.along[chosen], facing.place[chosen]
-            gap[chosen] = np.minimum(*(kind.gaps(along, frames, at[place], row) for at in ends))
+            gap[chosen] = np.min([kind.gaps(along, frames, at[place], row) for at in ends], axis=0)
         return np.asarray(gap[self._covered.decisive(facing.place, gap, len(ends[0]))])
 
     @staticmethod
@@ -434,6 +435,11 @@ class Separation:
         return len(self.pairs)
 
     @property
+    def bodies(self) -> tuple[Hull, ...]:
+        """The bodies, in the order of their indices."""
+        return tuple(self.hulls.values())
+
+    @property
     def labels(self) -> tuple[tuple[str, str], ...]:
         """Names of the two bodies of each pair, in the order of the pairs."""
         names = tuple(self.hulls)
@@ -444,9 +450,7 @@ class Separation:
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
-        return Separation(
-            self.name, self.placements, self.hulls, movers=self.movers, covers=covers, assumed=self.assumed, **parts
-        )
+        return replace(self, covers=covers, **parts)
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:

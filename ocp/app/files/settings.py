@@ -1,13 +1,6 @@
 """Read settings: TOML files, by name and expected type, with errors that name the line; obstacles; limits of MoveIt.
 
-A file of obstacles has the shapes in world, each under [[obstacle]]:
-
-[[obstacle]]
-shape = "box"                       # or sphere, capsule, cylinder, halfspace, mesh
-size = [0.06, 0.06, 0.3]            # m
-position = [0.55, 0.0, 0.45]        # m
-rpy = [0, 0, 0.5]                   # rad, optional: rotations about the world's x, then y, then z axis
-
+A file of obstacles has the shapes in world, each under [[obstacle]], as docs/guide/command.md shows them.
 `joint_limits.yaml` is the file in which MoveIt keeps the limits that a URDF cannot state.
 """
 
@@ -18,13 +11,15 @@ import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 from warnings import warn
 
+import casadi as ca
 import numpy as np
 
-from models import Box, Capsule, Cylinder, HalfSpace, Mesh, ModelError, ModelWarning, Robot, Sphere
+from models import Box, Capsule, Cylinder, HalfSpace, Mesh, ModelError, ModelWarning, MovingObstacle, Robot, Sphere
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
 from models.shapes.shapes import Shape
@@ -37,11 +32,13 @@ TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 BETWEEN = re.compile(r"[,=\[\]{}#]")
 ERROR_LINE = re.compile(r"\(at line (\d+)")
-Place = tuple[Any, ...]
-
-
+Place: TypeAlias = tuple[Any, ...]
+T = TypeVar("T")
+Readers: TypeAlias = dict[str, tuple[Any, ...]]
+"""Functions that read the entries of a table, by name, each with its arguments besides the table and the name."""
 REQUIRED = object()
 """Default value that marks an entry as required."""
+BY_JOINT = "a table of joints and numbers: { elbow = 1.2 }"
 
 
 class TomlTable:
@@ -50,7 +47,10 @@ class TomlTable:
     Attributes:
         file: Name of the file.
         place: Keys and indices that lead from the root to the table.
+        joints: Names of the joints for which entries may give numbers by name.
     """
+
+    joints: tuple[str, ...] = ()
 
     def __init__(self, file: str, values: Any, *, place: Place, texts: Sequence[str], lines: dict[Place, int]) -> None:
         self.file, self.place = file, place
@@ -117,6 +117,14 @@ class TomlTable:
         value = self._read(name, default, expected, fits)
         return value if value is None or value is default else float(value)
 
+    def positive(self, name: str, unit: str, default: Any = None) -> Any:
+        """Return the entry `name` after checking that it is a number above 0."""
+        return self.number(name, f"a number above 0, {unit}", default, least=0.0)
+
+    def nonnegative(self, name: str, unit: str, default: Any = None) -> Any:
+        """Return the entry `name` after checking that it is a number, 0 or more."""
+        return self.number(name, f"a number of 0 or more, {unit}", default, least=-1e-300)
+
     def count(self, name: str, expected: str, default: Any = None) -> Any:
         """Return the entry `name` after checking that it is an integer, 0 or more."""
 
@@ -127,43 +135,68 @@ class TomlTable:
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
         """Return the entry `name` as a vector of `size` numbers, or of any length if `size` is None."""
+        return self._array(name, default, expected, lambda shape: len(shape) == 1 and size in (None, shape[0]))
+
+    def rows(self, name: str, size: int, expected: str, default: Any = None) -> Any:
+        """Return the entry `name` as a matrix of rows of `size` numbers."""
+        return self._array(name, default, expected, lambda shape: len(shape) == 2 and shape[1] == size)
+
+    def _array(self, name: str, default: Any, expected: str, has_shape: Callable[[tuple[int, ...]], bool]) -> Any:
+        """Return the entry `name` as an array after checking its shape and that its numbers are finite."""
 
         def fits(value: Any) -> bool:
             try:
-                vector = floats(value)
+                array = floats(value)
             except NOT_NUMBERS:
                 return False
-            return vector.ndim == 1 and bool(np.isfinite(vector).all()) and size in (None, len(vector))
+            return isinstance(value, list) and has_shape(array.shape) and bool(np.isfinite(array).all())
 
-        value = self._read(name, default, expected, lambda value: isinstance(value, list) and fits(value))
+        value = self._read(name, default, expected, fits)
         return value if value is None or value is default else np.array(value, dtype=float)
 
-    def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
-        """Return the entry `name` as a dictionary of numbers by name; empty if the entry is missing."""
+    def numbers_by_name(self, name: str, expected: str, *, least: float = -np.inf) -> dict[str, float]:
+        """Return the entry `name` as a dictionary of numbers above `least` by name; empty if the entry is missing."""
         table = self.table(name, expected)
         if table is None:
             return {}
         for key, value in table._values.items():
-            if not np.isfinite(real(value)):
-                raise table.error(key, f"{key} must be a number, not {value!r}")
+            if not np.inf > real(value) > least:
+                raise table.error(key, f"{key} must be {expected if least > -np.inf else 'a number'}, not {value!r}")
         return {key: float(value) for key, value in table._values.items()}
+
+    def values(self, readers: Readers) -> dict[str, Any]:
+        """Return the entries that are not missing, by name, each read by the function of its name."""
+        values = {name: read(self, name, *arguments) for name, (read, *arguments) in readers.items()}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def build(self, kind: Callable[..., T], readers: Readers, **others: Any) -> T:
+        """Return `kind(**values)` of all entries of the table and other arguments; errors of `kind` name the line."""
+        values = self.values(readers) | others
+        self.done()
+        with located_errors(self):
+            return kind(**values)
+
+    def nested(self, name: str, kind: Callable[..., T], readers: Readers) -> T | None:
+        """Return what `build` makes of the nested table `name`; None if it is missing."""
+        table = self.table(name, f"a table of {', '.join(readers)}")
+        return None if table is None else table.build(kind, readers)
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
         """Return the entry `name` as a list of texts; empty if it is missing."""
-        texts = self._read(
-            name, [], expected, lambda value: isinstance(value, list) and all(isinstance(one, str) for one in value)
-        )
-        return tuple(texts)
 
-    def pairs(self, name: str, expected: str) -> list[tuple[str, str]]:
+        def fits(value: Any) -> bool:
+            return isinstance(value, list) and all(isinstance(word, str) for word in value)
+
+        return tuple(self._read(name, [], expected, fits))
+
+    def pairs(self, name: str, expected: str) -> tuple[tuple[str, str], ...]:
         """Return the entry `name` as a list of pairs of texts; empty if it is missing."""
 
         def fits(value: Any) -> bool:
-            return isinstance(value, list) and all(
-                isinstance(one, list) and len(one) == 2 and all(isinstance(word, str) for word in one) for one in value
-            )
+            pairs = isinstance(value, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in value)
+            return pairs and all(isinstance(word, str) for pair in value for word in pair)
 
-        return [(one, other) for one, other in self._read(name, [], expected, fits)]
+        return tuple((first, second) for first, second in self._read(name, [], expected, fits))
 
     def raw(self, name: str, default: Any = None) -> Any:
         """Return the entry `name`, which may be of any type, without a check."""
@@ -184,33 +217,26 @@ class TomlTable:
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
         """Return a nested table with its place in the file, so that its errors name the line."""
-        return TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
+        table = TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
+        table.joints = self.joints
+        return table
 
     def tables(self, name: str) -> list[TomlTable]:
         """Return all tables of the array of tables [[name]]."""
-        tables = self._read(
-            name,
-            [],
-            f"tables, each headed [[{name}]]",
-            lambda value: isinstance(value, list) and all(isinstance(values, dict) for values in value),
-        )
+
+        def fits(value: Any) -> bool:
+            return isinstance(value, list) and all(isinstance(values, dict) for values in value)
+
+        tables = self._read(name, [], f"tables, each headed [[{name}]]", fits)
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Raise ProblemError if the table has entries with names other than the given ones, before any entry is read.
-
-        Raises:
-            ProblemError: An entry is unknown; names its line and the known entries.
-        """
+        """Raise ProblemError if the table has entries of other names than the given ones."""
         self._read_names.extend(names)
         self.done()
 
     def done(self) -> None:
-        """Raise ProblemError if the table has an entry that was not read, because such an entry is unknown.
-
-        Raises:
-            ProblemError: An entry is unknown; names its line and the known entries.
-        """
+        """Raise ProblemError if the table has an entry that was not read; it names the line and the known entries."""
         for name in self._values:
             if name not in self._read_names:
                 similar = get_close_matches(name, self._read_names, n=2)
@@ -282,23 +308,23 @@ def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None
 
 
 def joint_values(
-    entries: TomlTable, name: str, names: tuple[str, ...], *, default: float, expected: str, least: float | None = None
+    entries: TomlTable, name: str, default: float, expected: str = BY_JOINT, least: float | None = None
 ) -> Any:
     """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
 
-    Joints without a number get `default`. If `least` is given, the entry may also be one number above `least` for all
-    joints, which is returned as it is.
+    Joints without a number get `default`. If `least` is given, all numbers are above it, and the entry may also be one
+    number for all joints, which is returned as it is.
     """
     if name not in entries:
         return None
     if least is not None and not isinstance(entries.raw(name), dict):
         return entries.number(name, expected, least=least)
-    by_joint = entries.numbers_by_name(name, expected)
+    by_joint = entries.numbers_by_name(name, expected, least=-np.inf if least is None else least)
     for joint in by_joint:
-        if joint not in names:
-            table = entries.required_table(name)
-            raise table.error(joint, f"the robot has no independent joint {joint!r}; it has {', '.join(names)}")
-    return np.array([by_joint.get(joint, default) for joint in names])
+        if joint not in entries.joints:
+            table, names = entries.required_table(name), ", ".join(entries.joints)
+            raise table.error(joint, f"the robot has no independent joint {joint!r}; it has {names}")
+    return np.array([by_joint.get(joint, default) for joint in entries.joints])
 
 
 # ---- joint limits ----------------------------------------------------------------------------------------------
@@ -309,9 +335,6 @@ LIMIT_KEYS = [key for kind in LIMIT_KINDS for key in (f"has_{kind}_limits", f"ma
 UNUSED_KEYS = {"max_position": "position", "min_position": "position", "max_deceleration": "deceleration"}
 """Known keys that `Limits` has no field for, and the kind of limit that they belong to."""
 OTHER_KEYS = {"has_position_limits", "has_deceleration_limits", "angle_wraparound", "has_soft_limits", *UNUSED_KEYS}
-
-
-SHAPES = ("box", "sphere", "capsule", "cylinder", "halfspace", "mesh")
 
 
 def read_obstacles(file: FileName) -> tuple[Shape, ...]:
@@ -328,46 +351,48 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
     return shapes
 
 
-def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
-    """Return the shapes that the [[obstacle]] tables of a TOML file describe; mesh files are relative to `folder`."""
-    shapes = []
+def obstacles_of(entries: TomlTable, folder: Path, *, moving: bool = False) -> tuple[Any, ...]:
+    """Return the obstacles that the [[obstacle]] tables of a TOML file describe; mesh files are relative to `folder`.
+
+    If `moving` is true, an obstacle may have a constant `velocity`, m/s, and is then a MovingObstacle.
+    """
+    obstacles = list[Any]()
     for table in entries.tables("obstacle"):
-        shape = table.choice("shape", SHAPES, REQUIRED)
-        with located_errors(table):
-            shapes.append(read_shape(table, shape, folder))
-        table.done()
-    return tuple(shapes)
+        velocity = table.vector("velocity", 3, "three numbers, m/s") if moving else None
+        obstacle = read_shape(table, folder)
+        with located_errors(table, "velocity"):
+            move = None if velocity is None else partial(ca.mtimes, ca.DM(velocity))
+            obstacles.append(obstacle if move is None else MovingObstacle(obstacle, move))
+    return tuple(obstacles)
 
 
-def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation matrix (3, 3) of a table's entry `rpy` (roll, pitch, yaw, rad); the identity if missing."""
-    angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
+def rotation_of(entries: TomlTable, _: str = "", entry: str = "rpy") -> Array:
+    """Return the rotation matrix (3, 3) of an entry with roll, pitch and yaw, rad; the identity if it is missing."""
+    angles = entries.vector(entry, 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
 
-def read_shape(table: TomlTable, shape: str, folder: Path = Path()) -> Shape:
-    """Return the shape, of a kind in SHAPES, that a table describes; names of mesh files are relative to `folder`."""
+POSITION, SIZE = ((TomlTable.vector, 3, f"three {things}", REQUIRED) for things in ("numbers, m", "lengths, m"))
+LENGTH, TURN = (TomlTable.positive, "m", REQUIRED), (rotation_of, "rpy")
+NORMAL = (TomlTable.vector, 3, "three numbers: out of what is solid", REQUIRED)
+SHAPES: dict[str, tuple[type, Readers]] = {
+    "box": (Box, {"size": SIZE, "position": POSITION, "rotation": TURN}),
+    "sphere": (Sphere, {"radius": LENGTH, "position": POSITION}),
+    "capsule": (Capsule, {"radius": LENGTH, "start": POSITION, "end": POSITION}),
+    "cylinder": (Cylinder, {"radius": LENGTH, "length": LENGTH, "position": POSITION, "rotation": TURN}),
+    "halfspace": (HalfSpace, {"normal": NORMAL, "point": POSITION}),
+    "mesh": (Mesh, {"position": POSITION[:3], "rotation": TURN, "scale": (TomlTable.positive, "m for each unit")}),
+}
+"""Kinds of shapes, with their entries."""
 
-    def place(name: str = "position") -> Any:
-        return table.vector(name, 3, "three numbers, m", REQUIRED)
 
-    def length(name: str) -> Any:
-        return table.number(name, "a number above 0, m", REQUIRED, least=0.0)
-
-    if shape == "box":
-        return Box(table.vector("size", 3, "three lengths, m", REQUIRED), place(), rotation_of(table))
-    if shape == "sphere":
-        return Sphere(length("radius"), place())
-    if shape == "capsule":
-        return Capsule(length("radius"), place("start"), place("end"))
-    if shape == "cylinder":
-        return Cylinder(length("radius"), length("length"), place(), rotation_of(table))
-    if shape == "halfspace":
-        return HalfSpace(table.vector("normal", 3, "three numbers: out of what is solid", REQUIRED), place("point"))
-    name = table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
-    scale = table.number("scale", "a number above 0: m for each unit of the file", 1.0, least=0.0)
-    position = table.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0))
-    return Mesh(file=folder / name, position=position, rotation=rotation_of(table), scale=scale)
+def read_shape(table: TomlTable, folder: Path = Path(), kinds: Iterable[str] = SHAPES) -> Any:
+    """Return the shape that a whole table describes; names of mesh files are relative to `folder`."""
+    kind, readers = SHAPES[table.choice("shape", kinds, REQUIRED)]
+    others = (
+        {"file": folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)} if kind is Mesh else {}
+    )
+    return table.build(kind, readers, **others)
 
 
 def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:
@@ -398,8 +423,7 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
             tree = tree.get(key, tree)
     entries = tree.get("joint_limits") if isinstance(tree, Mapping) else None
     if not isinstance(entries, Mapping):
-        words = f"{file} has no mapping joint_limits of joint names to limits"
-        raise ProblemError(words, name="joint_limits", value=repr(entries)[:80])
+        raise _invalid(file, "joint_limits", "must be a mapping of joint names to limits", entries)
     names, unused = {joint.name for joint in robot.joints}, []
     limits: dict[str, dict[str, float]] = {kind: {} for kind in LIMIT_KINDS}
     for name, entry in entries.items():
@@ -407,8 +431,7 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
             unused.append(f"joint {repr(name)[:80]}, which {robot.name!r} does not have")
             continue
         if not isinstance(entry, Mapping):
-            words = f"{file}: joint {name!r} must have a mapping of limits, not {repr(entry)[:80]}"
-            raise ProblemError(words, name=name, value=repr(entry)[:80])
+            raise _invalid(file, name, "must be a mapping of limits", entry)
         unused += [f"{note} of joint {name!r}" for note in _unused_keys(entry)]
         for kind in LIMIT_KINDS:
             if (value := _limit(file, name, entry, kind)) is not None:
@@ -443,15 +466,14 @@ def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> f
     """Return a limit of a joint in joint_limits.yaml, infinite for no limit, or None if its entry gives none."""
     has, value = entry.get(f"has_{kind}_limits"), entry.get(f"max_{kind}")
     if has is not None and not isinstance(has, bool):
-        words = f"{file}: joint {joint!r}: has_{kind}_limits must be true or false, not {repr(has)[:80]}"
-        raise ProblemError(words, name=joint, value=repr(has)[:80], limit=(True, False))
+        raise _invalid(file, joint, f"has_{kind}_limits must be true or false", has, limit=(True, False))
     if has is False:
         return float(np.inf)
     if value is None and has is None:
         return None
     if not real(value) > 0:
-        words = f"{file}: joint {joint!r}: max_{kind} must be a positive number, not {repr(value)[:80]}; for no limit, "
-        raise ProblemError(words + f"has_{kind}_limits: false", name=joint, value=repr(value)[:80], limit=0.0)
+        words = f"max_{kind} must be a positive number (has_{kind}_limits: false for no limit)"
+        raise _invalid(file, joint, words, value, limit=0.0)
     return real(value)
 
 
@@ -459,9 +481,14 @@ def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
     """Return the default scaling factor of velocities or accelerations that joint_limits.yaml states, else 1."""
     key = f"default_{kind}_scaling_factor"
     if not 0 < real(tree.get(key, 1.0)) <= 1:
-        words = f"{file}: {key} must be a number above 0, at most 1, not {repr(tree[key])[:80]}"
-        raise ProblemError(words, name=key, value=repr(tree[key])[:80], limit=(0.0, 1.0))
+        raise _invalid(file, key, "must be a number above 0, at most 1", tree[key], limit=(0.0, 1.0))
     return float(tree.get(key, 1.0))
+
+
+def _invalid(file: FileName, name: str, expected: str, value: Any, *, limit: Any = None) -> ProblemError:
+    """Return the error about an invalid entry of joint_limits.yaml."""
+    shown = repr(value)[:80]
+    return ProblemError(f"{file}: {name}: {expected}, not {shown}", name=name, value=shown, limit=limit)
 
 
 def _unused_keys(entry: Mapping[Any, Any]) -> list[str]:

@@ -42,7 +42,7 @@ def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
     """Return the shapes of the bodies and obstacles of a collision scene as convex hulls, by name."""
     return {
         body.name: Hull(
-            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0))
+            body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0)), body.link
         )
         for body in scene.bodies
     }
@@ -81,7 +81,7 @@ def near_pairs(
 
     Returns:
         Configuration, among (M, n) of a fixed base, and pair of each; its distance beyond the clearance, m, shape (K,);
-            and the gradient of this distance, by finite differences, or 0 without `gradients`, shape (K, n).
+            and the gradient of this distance, or 0 without `gradients`, shape (K, n).
     """
     (placements, bodies), n, near = prepared_pairs(scene), joints.shape[1], scene.clearance + reach
 
@@ -95,10 +95,13 @@ def near_pairs(
     at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
     gradient = np.zeros((len(at), n))
     if gradients and len(at):
+        # a distance is the largest gap along any direction: its derivative is that of the gap along the maximiser
         rows, index = np.unique(at, return_inverse=True)
-        moved = frames_at((joints[rows, None] + SLIDING.difference * np.eye(n)).reshape(-1, n))
-        places = (n * index[:, None] + np.arange(n)).ravel()
-        gradient = (bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / SLIDING.difference
+        facing = bodies.nearest(frames, at, pair)[0]
+        gap_now = bodies.chords(facing, frames, (at,))
+        for joint, change in enumerate(SLIDING.difference * np.eye(n)):
+            moved = bodies.chords(facing, frames_at(joints[rows] + change), (index,))
+            gradient[:, joint] = (moved - gap_now) / SLIDING.difference
     return at, pair, gap - scene.clearance, gradient
 
 

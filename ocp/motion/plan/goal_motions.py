@@ -192,12 +192,7 @@ def _constant_speed_candidates(task: GoalTask, paths: list[JointPath]) -> list[C
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidates along joint paths, with the timing that the request needs.
-
-    That is the least time, any timing within the limits of the actuators, or constant speed.
-    """
-    if task.is_fastest:
-        return [_fastest_candidate(task, path) for path in paths]
+    """Return audited candidates along joint paths, at constant speed unless actuator limits determine the timing."""
     return _candidates_within_limits(task, paths) if task.is_dynamic else _constant_speed_candidates(task, paths)
 
 
@@ -222,7 +217,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
     return []
 
 
-def _fastest_candidate(task: GoalTask, path: JointPath) -> Candidate:
+def fastest_candidate(task: GoalTask, path: JointPath) -> Candidate:
     """Return an audited, locally fastest motion near a path or, if none is found, one that stops at path corners."""
     candidate = _spline_candidate(task, path, None)
     if not candidate.passed:

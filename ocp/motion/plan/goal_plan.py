@@ -7,7 +7,9 @@ listed with the reason.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, interruptible, report
+from ocp.console import TimeLimitReached, interruptible, report, time_left
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.constant_jerk import TorqueLimits
 from ocp.motion.local.inverse_kinematics import spread_points
@@ -24,13 +26,14 @@ from ocp.motion.plan.goal_motions import (
     GoalTask,
     attains_bound,
     cost_bound,
+    fastest_candidate,
     motions_along,
     synchronised_candidates,
 )
 from ocp.motion.result.candidate import Candidate, Reason, Rejection
 from ocp.motion.result.solved_plan import Part, SolvedPlan
-from ocp.motion.sampling.joint_paths import StraightMotions
-from ocp.motion.sampling.path_search import JointPath, TreeSearch, find_paths
+from ocp.motion.sampling.joint_paths import StraightMotions, optimise_length
+from ocp.motion.sampling.path_search import JointPath, TreeSearch, find_paths, search_paths
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
 from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip_to_limits
@@ -58,20 +61,34 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
 
 
 def _find_candidates(task: GoalTask, seconds: float) -> list[Candidate]:
-    """Return all audited candidate motions to the goals that are found within the given time, s."""
+    """Return audited candidate motions to the goals that are found within the given time, s.
+
+    The search ends when a motion attains the lower bound of the cost.
+    """
     settings, candidates = task.request.settings, list[Candidate]()
     if task.is_fastest:
         with suppress(TimeLimitReached), task.request.limited((1 - settings.search_share) * seconds):
             candidates = synchronised_candidates(task)
-    if not any(attains_bound(task, candidate) for candidate in candidates):
-        try:
-            with task.request.limited(settings.search_share * seconds):
-                paths = _find_paths(task, seconds)
-            report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
-            candidates += motions_along(task, paths)
-        except (SolveError, TimeLimitReached):
-            if not any(candidate.passed for candidate in candidates):
-                raise
+    if any(attains_bound(task, candidate) for candidate in candidates):
+        return candidates
+    try:
+        if not task.is_fastest:
+            return motions_along(task, list(_find_paths(task, seconds)))
+        paths = list[JointPath]()
+        for path in _find_paths(task, seconds):
+            paths.append(path)
+            candidates.append(fastest_candidate(task, path))
+            if attains_bound(task, candidates[-1]):
+                return candidates
+        shortest = min(paths, key=lambda path: path.length)
+        if len(shortest.joints) > 2:
+            with task.request.limited(settings.search_share * time_left()):
+                limits = task.bounds.lower, task.bounds.upper
+                joints = optimise_length(task.motions, shortest.joints, task.scale, limits=limits)
+            candidates.append(fastest_candidate(task, replace(shortest, joints=joints)))
+    except (SolveError, TimeLimitReached):
+        if not any(candidate.passed for candidate in candidates):
+            raise
     return candidates
 
 
@@ -165,20 +182,37 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
     return [np.array(joints) for joints in product(*shifts)]
 
 
-def _find_paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Return collision-free paths of several homotopy classes, the shortest first, or raise SolveError for none."""
+def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
+    """Yield collision-free paths, or raise SolveError if there is none.
+
+    They have several homotopy classes and locally shortest length, and the shortest is the first. Where only the time
+    of the motion counts, they are neither optimised nor sorted.
+    """
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
     search = TreeSearch(task.motions, np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper), task.scale)
-    options: dict[str, Any] = {"limits": (bounds.lower, bounds.upper), "seed": request.seed}
-    reason, name = "in all random searches", "search"
+    share = request.settings.search_share
+    shared: dict[str, Any] = {"seed": request.seed, "settings": request.settings.search}
+    reason, name, has_path = "in all random searches", "search", False
     try:
-        paths = find_paths(search, task.start, task.goals, **options, settings=request.settings.search)
-        if paths:
-            return paths
+        if task.is_fastest:
+            paths = search_paths(search, task.start, task.goals, **shared)
+        else:
+            with request.limited(share * seconds):
+                paths = iter(find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **shared))
+        while True:
+            with request.limited(share * time_left()):
+                path = next(paths, None)
+            if path is None:
+                break
+            report(f"a path of length {path.length:.4g}")
+            has_path = True
+            yield path
     except TimeLimitReached:
         reason, name = f"within the time limit of {seconds:.4g} s", "time_limit"
+    if has_path:
+        return
     goal = task.goals[np.linalg.norm((task.goals - task.start) * task.scale, axis=1).argmin()]
     places = task.start + np.linspace(0.0, 1.0, request.settings.guess_times)[:, None] * (goal - task.start)
     worst = min(

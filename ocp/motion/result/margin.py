@@ -14,7 +14,6 @@ of the samples nearby, eight times the error of their linear interpolation.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -303,8 +302,9 @@ def _distance_requirements(plan: Plan) -> list[Requirements]:
     tip, rows = plan.machine.robot.tip, list[Requirements]()
     for name, separation in separations:
         groups: dict[tuple[str, ...], list[int]] = {}
-        for pair, (bodies, observer) in enumerate(zip(separation.labels, separation.pairs[:, 2], strict=True)):
-            carries_tip = tip is not None and any(re.split(r"/| hull ", body)[0] == tip for body in bodies)
+        links = [body.link for body in separation.bodies]
+        for pair, (first, second, observer) in enumerate(separation.pairs):
+            carries_tip = tip is not None and tip in (links[first], links[second])
             moved_by = ((BASE, observer == WORLD), (OBSTACLE, observer == WORLD), (TOOL, carries_tip))
             groups.setdefault(tuple(each for each, moves in moved_by if moves), []).append(pair)
         for moved, pairs in groups.items():

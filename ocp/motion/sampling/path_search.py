@@ -13,6 +13,7 @@ accept a seed only once for each process, so that a repeated call has another re
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -209,37 +210,49 @@ def find_paths(
     Raises:
         TimeLimitReached: The time limit has passed before a path was found.
     """
-    motions, scale = search.motions, search.scale
-    lengths = np.linalg.norm((goals - start) * scale, axis=1)
-    clear = motions.are_clear(np.broadcast_to(start, goals.shape), goals)
-    paths = [JointPath(np.array([start, goals[k]]), int(k), float(lengths[k])) for k in np.flatnonzero(clear)]
-    paths.sort(key=lambda path: path.length)
-    if len(paths) and paths[0].length <= lengths.min():
-        return paths[: settings.most_paths]
+    motions, paths = search.motions, list[JointPath]()
     try:
-        number, last, samples = 0, settings.attempts, settings.first
-        while number < last:
-            random = np.random.default_rng([seed, number])
-            joints = connect(search, start, goals, random=random, most_samples=samples)
-            if joints is not None:
-                joints = shorten(motions, joints, scale, random=random)
-                paths = _with_path(search, paths, _path_of(joints, goals, scale))
-                last = min(last, number + 1 + settings.classes)
-            number += 1
-            if not paths and number % 2 == 0:
-                samples *= 2
+        for path in search_paths(search, start, goals, seed=seed, settings=settings):
+            paths = _with_path(search, paths, path)
         for path in paths[: settings.most_paths]:
-            joints = optimise_length(motions, path.joints, scale, limits=limits)
-            paths = _with_path(search, [p for p in paths if p is not path], _path_of(joints, goals, scale))
+            joints = optimise_length(motions, path.joints, search.scale, limits=limits)
+            paths = _with_path(search, [p for p in paths if p is not path], _path_of(search, joints, goals))
     except TimeLimitReached:
         if not paths:
             raise
     return paths[: settings.most_paths]
 
 
-def _path_of(joints: Array, goals: Array, scale: Array) -> JointPath:
+def search_paths(
+    search: TreeSearch, start: Array, goals: Array, *, seed: int, settings: PathSearchSettings
+) -> Iterator[JointPath]:
+    """Yield collision-free paths, shortened but not optimised, as they are found; see `find_paths`.
+
+    Raises:
+        TimeLimitReached: The time limit has passed.
+    """
+    motions = search.motions
+    clear = motions.are_clear(np.broadcast_to(start, goals.shape), goals)
+    paths = [_path_of(search, np.array([start, goal]), goals) for goal in goals]
+    straight = sorted((paths[k] for k in np.flatnonzero(clear)), key=lambda path: path.length)
+    yield from straight[: settings.most_paths]
+    if straight and straight[0].length <= min(path.length for path in paths):
+        return
+    number, last, samples, has_path = 0, settings.attempts, settings.first, bool(straight)
+    while number < last:
+        random = np.random.default_rng([seed, number])
+        joints = connect(search, start, goals, random=random, most_samples=samples)
+        number += 1
+        if joints is not None:
+            has_path, last = True, min(last, number + settings.classes)
+            yield _path_of(search, shorten(motions, joints, search.scale, random=random), goals)
+        if not has_path and number % 2 == 0:
+            samples *= 2
+
+
+def _path_of(search: TreeSearch, joints: Array, goals: Array) -> JointPath:
     goal = int(np.abs(goals - joints[-1]).max(axis=1).argmin())
-    return JointPath(joints, goal, path_length(joints, scale))
+    return JointPath(joints, goal, path_length(joints, search.scale))
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:

@@ -26,16 +26,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
 import scipy
 
 from models.checks import Array
-from ocp.console import TimeLimitReached, casadi_silenced, check_time
+from ocp.console import casadi_silenced, check_time, time_left
 from ocp.errors import SolveError
-from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
+from ocp.motion.builders.constant_jerk import (
+    ConstantJerkMotion,
+    TorqueLimits,
+    least_durations,
+    synchronised_motion,
+)  # fmt: skip
 from ocp.motion.sampling.joint_paths import StraightMotions, points_along
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
@@ -179,20 +184,21 @@ def optimal_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    If no motion is feasible, return the last one. The sequence ends when the cost decreases by less than `least_gain`.
+    If no motion is feasible, return the last one. The sequence ends when a program predicts that a step in the first
+    trust region decreases the cost by less than `least_gain`, or when two steps do.
     """
     settings = search.settings
     penalty = settings.penalty if search.horizon is None else settings.violation
     best: _State | None = state if state.is_feasible else None
     idle = 0
     for _ in range(settings.most_steps):
-        try:
-            check_time()
-        except TimeLimitReached:
-            if best is None:
-                raise
+        if best is not None and time_left() <= 0:
             break
-        trial = search.step(state, region)
+        check_time()
+        step = search.step(state, region)
+        if step is not None and state.is_feasible and step.gain * max(1.0, settings.first / region) < least_gain:
+            break  # the predicted gain is a concave function of the trust region
+        trial = None if step is None else search.evaluate(step.points, step.duration)
         gain = 0.0 if trial is None else state.merit(penalty) - trial.merit(penalty)
         if trial is None or gain <= 0:
             region *= settings.narrowing
@@ -243,6 +249,14 @@ class _State:
         return float(np.log(self.cost)) + penalty * self.excess
 
 
+class _Step(NamedTuple):
+    """Control points (K, n) and duration, s, after a step, and the relative decrease of the cost that it predicts."""
+
+    points: Array
+    duration: float
+    gain: float
+
+
 _Rows: TypeAlias = tuple[Any, Array, Array, float]
 """Linearised limits: derivatives with respect to control points and log T, ratios to the limits, allowed excess."""
 
@@ -257,10 +271,9 @@ class _Search:
         bounds = limits.bounds
         self.start, self.end, self.size = path[0], path[-1], path.shape[1]
         self.degree = 3 if np.isfinite(bounds.jerk).any() or cost.squares[2].any() else 2
-        spread = np.ptp(path, axis=0).max()
         self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
         self.has_rate_limit = np.isfinite(bounds.velocity)
-        self.spread = np.where(self.has_rate_limit, 0.0, spread)
+        self.spread = np.where(self.has_rate_limit, 0.0, np.ptp(path, axis=0).max())
         self.breaks = self._breaks(path)
         self.knots = np.concatenate([np.zeros(self.degree), self.breaks, np.ones(self.degree)])
         self.count = len(self.breaks) - 1 + self.degree
@@ -291,22 +304,32 @@ class _Search:
         return 2 * order - 1, scipy.sparse.kron(basis, joints, format="csr")
 
     def _breaks(self, path: Array) -> Array:
-        """Return the spline knots as fractions of the duration, with short intervals at both ends."""
+        """Return the spline knots as fractions of the duration, with short intervals at both ends.
+
+        In free time, the times at which the fastest motion of the slowest joint switches are knots, so that a spline
+        attains the least time where nothing else slows the joints down.
+        """
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
             least = np.where(self.has_rate_limit, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
             least = least if self.horizon is None else self.horizon
         first = min(max(build_up / least if least > 0 else 0.0, settings.shortest), 1 / settings.intervals)
-        short = [first]
-        while self.degree == 3 and short[-1] * settings.growth < 1 / settings.intervals:
+        short = [first] if self.degree == 3 else []
+        while short and short[-1] * settings.growth < 1 / settings.intervals:
             short.append(short[-1] * settings.growth)
-        short = short if self.degree == 3 else []
         rest = 1 - 2 * sum(short)
         inner = max(round(rest * settings.intervals), 1)
         lengths = np.concatenate([short, np.full(inner, rest / inner), short[::-1]])
-        breaks = np.append(0.0, np.cumsum(lengths))
-        return np.asarray(breaks / breaks[-1])
+        breaks = np.append(0.0, np.cumsum(lengths)) / sum(lengths)
+        slowest = [int(least_durations(np.abs(self.end - self.start), bounds).argmax())]
+        if self.horizon is None and self.start[slowest] != self.end[slowest]:
+            own = JointBounds(*(limit[slowest] for limit in bounds))
+            phases = synchronised_motion(self.start[slowest], self.end[slowest], own).durations
+            switches = np.cumsum(phases[:-1]) / phases.sum()
+            nearest = np.abs(breaks[1:-1, None] - switches).argmin(axis=0) + 1
+            breaks = np.union1d(np.delete(breaks, nearest), switches)
+        return np.asarray(breaks)
 
     def _values(self, places: Array, order: int) -> Any:
         """Return the matrix that maps control points to a derivative at M fractions of the duration. Shape (M, K)."""
@@ -352,10 +375,9 @@ class _Search:
 
     def evaluate(self, points: Array, duration: float) -> _State:
         """Evaluate and linearise the constraints of a motion, given its free control points and its duration."""
-        inner = points.ravel()[self.free]
-        points = (self.fixed + duration * self.moving).ravel()
-        points[self.free] = inner
-        points = points.reshape(self.count, self.size)
+        fixed = (self.fixed + duration * self.moving).ravel()
+        fixed[self.free] = points.ravel()[self.free]
+        points = fixed.reshape(self.count, self.size)
         parts = [*self._derivative_rows(points, duration), self._clearance_rows(points)]
         if len(self.limits.torques.limited):
             parts += self._torque_rows(points, duration)
@@ -418,8 +440,8 @@ class _Search:
         values = (weights.data[:, None] * by_joint[weights.row]).ravel()
         return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
-    def step(self, state: _State, region: float) -> _State | None:
-        """Return the next iterate, by a linear or quadratic program in a trust region; None if that has no solution."""
+    def step(self, state: _State, region: float) -> _Step | None:
+        """Return a step, by a linear or quadratic program in a trust region; None if that has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
@@ -436,13 +458,14 @@ class _Search:
         solver = ca.conic("step", *(("ipqp", shape, QUADRATIC) if self.residuals else ("highs", shape, LINEAR)))
         sides = {"lba": -np.inf, "uba": 1 - state.usages[kept], "lbx": np.minimum(lower, 0.0), "ubx": upper}
         with casadi_silenced():  # it warns of a degenerate program, which ends without success
-            solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
+            solution = solver(h=curvature, g=slope, a=matrix, **sides)
         if not solver.stats()["success"]:
             return None
-        change = solution.full().ravel()
+        change = solution["x"].full().ravel()
         moved = state.points.ravel().copy()
         moved[self.free] += change[:count]
-        return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
+        points, duration = moved.reshape(self.count, self.size), state.duration * (1 + change[count])
+        return _Step(points, duration, -float(solution["cost"]))
 
     def _cost_model(self, state: _State) -> tuple[ca.DM, Array]:
         """Return the Hessian and gradient of the relative cost in free control points, log duration and slack."""

@@ -48,7 +48,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
         words = f"capture: the chaser floats on a {chaser.base} base, the target on a {target.base} one"
         raise ProblemError(words, name="target", value=target.base, limit=chaser.base)
     if target.joint_size or len(target.robot.links) != 1:
-        words = "capture: the target must be one body without joints; use simplified(locked(robot, ...))"
+        words = "capture: the target must be one body without joints; use simplify(lock_joints(robot, ...))"
         raise ProblemError(words, name="target", value=target)
     if not chaser.joint_size:
         raise ProblemError("capture: the chaser has no joints to reach with", name="chaser", value=chaser)

@@ -8,12 +8,34 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Box, Foothold, ModelWarning, Sphere, rectangle
-from ocp import FreeTime, Goal, Plan, ProblemError, Steps, StepWeights, TipTask, Waypoints, plan_problem
+from models import Box, Foothold, FreeFloating, Link, ModelWarning, MovingObstacle, Sphere, planar_chain, rectangle
+from ocp import (
+    Anywhere,
+    Capture,
+    Cone,
+    FreeTime,
+    Goal,
+    Grasp,
+    IndexAtLeast,
+    InFoot,
+    JointFriction,
+    Pinned,
+    Plan,
+    ProblemError,
+    Start,
+    Steps,
+    StepWeights,
+    TipTask,
+    Waypoints,
+    Weights,
+    plan,
+    plan_problem,
+)
 from ocp.__main__ import main
 from ocp.app.files.task_file import Task, read_task
 from scripts.robots.steps import planar_biped
 from tests.ocp.app.motions import NAMES, write_robot
+from tests.ocp.motion.builders.captures import PLANAR_START, planar_capture, planar_chaser, planar_target
 
 START = "start = { shoulder = 0.3, elbow = 0.8, wrist = -0.5, slide = 0.15 }"
 ROBOT = '[robot]\nurdf = "robot.urdf"\ntip = "finger"\n'
@@ -145,7 +167,9 @@ def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:
-    with pytest.raises(ProblemError, match=r"give one table \[path\], \[goal\], \[waypoints\] or \[walk\]") as caught:
+    with pytest.raises(
+        ProblemError, match=r"give one of the tables \[path\], \[goal\], \[waypoints\], \[walk\], \[capture\]"
+    ) as caught:
         read(tmp_path, "[search]\nseed = 1\n")
     assert caught.value.name == "path"
 
@@ -260,3 +284,185 @@ def test_the_command_plans_a_walk(tmp_path: Path, capsys: Any) -> None:
     file = tmp_path / "walk.npz"
     assert main(["plan", str(tmp_path / "walk.toml"), "-o", str(file), "--quiet"]) == 0
     assert Plan.load(file).horizon > 1.5 + 2 * 0.3
+
+
+CAPTURE = """base = "planar"
+[robot.wheels]
+axes = [[0, 0, 1]]
+inertia = 0.02
+momentum = 6.0
+torque = 1.0
+mass = 0.2
+[capture]
+approach = 5.0
+detumble = { least = 4.0, most = 9.0, guess = 5.0 }
+cone = { direction = [-1, 0, 0], half_angle = 0.4, length = 0.25 }
+grasp = { force = 20.0, moment = 10.0 }
+friction = { viscous = 0.1, coulomb = { joint1 = 0.2 } }
+end = { joint2 = -1.5 }
+[capture.target]
+urdf = "target.urdf"
+tip = "target"
+tip_position = [-0.4, 0, 0]
+momentum = [0.45, 0, 0]
+pose = [1.9, 0.3, 0.0]
+[search]
+start = { joint1 = 1.2, joint2 = -2.0, joint3 = 0.6, wheel1 = 0.0 }
+[cost]
+velocity = 0
+effort = 1.0
+acceleration = { joint1 = 1.0, joint2 = 1.0, joint3 = 1.0 }
+time = 0.05
+[scene]
+look = false
+"""
+
+
+def read_capture(folder: Path, text: str) -> Task:
+    chain = planar_chain([0.8, 0.7, 0.3], [4.0, 3.0, 1.0], base=Link("hub", 60.0, (0, 0, 0), 6.0 * np.eye(3)))
+    chain.to_urdf(folder / "chaser.urdf")
+    planar_target().robot.to_urdf(folder / "target.urdf")
+    tip = f'tip = "{chain.tip_link}"\ntip_position = {np.asarray(chain.tip_translation).tolist()}'
+    (folder / "capture.toml").write_text(f'[robot]\nurdf = "chaser.urdf"\n{tip}\n{text}')
+    return read_task(folder / "capture.toml")
+
+
+def test_a_capture_has_the_bodies_the_phases_and_the_limits_of_its_tables(tmp_path: Path) -> None:
+    task = read_capture(tmp_path, CAPTURE)
+    capture, chaser = task.tasks, task.machine
+    assert isinstance(capture, Capture)
+    for machine, expected in ((chaser, planar_chaser()), (capture.target, planar_target())):
+        assert isinstance(machine, FreeFloating)
+        assert machine.base == "planar"
+        assert machine.robot.total_mass == pytest.approx(expected.robot.total_mass)
+        assert machine.robot.dof == expected.robot.dof
+        assert list(np.asarray(machine.conserved_momentum)) == pytest.approx(np.asarray(expected.conserved_momentum))
+    np.testing.assert_allclose(chaser.robot.velocity[-1], planar_chaser().robot.velocity[-1])
+    tips = [machine.tip_pose(np.array([0.1, 0.2, 0.3]), PLANAR_START).position for machine in (chaser, planar_chaser())]
+    np.testing.assert_allclose(np.array(tips[0]), np.array(tips[1]), atol=1e-12)
+    np.testing.assert_allclose(capture.target.robot.tip_translation, [-0.4, 0, 0])
+    assert (capture.approach, capture.detumble, capture.rest) == (5.0, FreeTime(4.0, 9.0, 5.0), True)
+    np.testing.assert_allclose(capture.target_base, [1.9, 0.3, 0.0])
+    assert isinstance(capture.cone, Cone)
+    assert (capture.cone.half_angle, capture.cone.length, capture.cone.depth) == (0.4, 0.25, Cone.depth)
+    assert capture.grasp == Grasp(20.0, 10.0)
+    assert isinstance(capture.friction, JointFriction)
+    np.testing.assert_allclose(np.asarray(capture.friction.coulomb, dtype=float), [0.2, 0, 0, 0])
+    np.testing.assert_allclose(np.asarray(capture.end, dtype=float), [np.nan, -1.5, np.nan, np.nan])
+    np.testing.assert_allclose(task.options["start"], PLANAR_START)
+    assert task.options["scene"] is False
+
+
+@pytest.mark.long
+def test_a_capture_in_a_file_costs_what_the_same_capture_costs_in_python(tmp_path: Path, capsys: Any) -> None:
+    text = CAPTURE.replace("{ least = 4.0, most = 9.0, guess = 5.0 }", "5.0")
+    text = text.replace("friction = { viscous = 0.1, coulomb = { joint1 = 0.2 } }\nend = { joint2 = -1.5 }\n", "")
+    read_capture(tmp_path, text)
+    request = planar_capture()
+    names = ("target", "target_base", "cone", "grasp")
+    capture = Capture(approach=5.0, detumble=5.0, **{name: request[name] for name in names})
+    expected = plan(request["chaser"], capture, start=request["start"], cost=request["cost"], scene=False)
+    file = tmp_path / "capture.npz"
+    assert main(["plan", str(tmp_path / "capture.toml"), "-o", str(file), "--quiet"]) == 0
+    assert Plan.load(file).cost == pytest.approx(expected.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "expected"),
+    [
+        ('base = "planar"', 'base = "fixed"', 12, 'base = "floating" or "planar"'),
+        ("approach = 5.0", "approach = -5", 13, "must be a number above 0, s"),
+        ("approach = 5.0\n", "", 12, "'approach' is missing"),
+        ("half_angle = 0.4, ", "", 15, "'half_angle' is missing"),
+        ("force = 20.0", "force = 0", 16, "must be a number above 0, N"),
+        ("[-1, 0, 0], half", "[0, 0, 0], half", 15, "direction must not be zero"),
+        ("viscous = 0.1", "viscus = 0.1", 17, "did you mean viscous"),
+        ("end = { joint2", "end = { joint5", 18, "no independent joint 'joint5'"),
+        ("pose = [1.9, 0.3, 0.0]", "pose = [1.9, 0.3]", 24, "3 numbers"),
+        ("momentum = [0.45, 0, 0]", "momentum = [0.45]", 23, "conserved_momentum"),
+        ("inertia = 0.02\n", "", 6, "'inertia' is missing"),
+        ('urdf = "target.urdf"', 'urdf = "ball.urdf"', 20, "there is no file"),
+    ],
+)
+def test_a_mistake_in_a_capture_is_reported_with_its_line(
+    tmp_path: Path, old: str, new: str, line: int, expected: str
+) -> None:
+    assert CAPTURE.count(old) == 1
+    with pytest.raises(ProblemError) as caught:
+        read_capture(tmp_path, CAPTURE.replace(old, new))
+    assert f"capture.toml, line {line}," in str(caught.value), str(caught.value)
+    assert expected in str(caught.value)
+
+
+def test_several_paths_are_tasks_at_the_same_time_and_a_pose_may_be_constant(tmp_path: Path) -> None:
+    text = f'[[path]]\n{PATH}tool = "free"\nbegin = 0.5\n'
+    text += '[[path]]\nlink = "fore"\nrelative_to = "upper"\npoint = [0.1, 0, 0]\n'
+    text += "direction = [0, 0, 1]\ntool_axis = [1, 0, 0]\n"
+    moving, held = read(tmp_path, text).tasks
+    assert (moving.begin, moving.rows) == (0.5, (3, 4, 5))
+    assert (held.link, held.relative_to, held.duration) == ("fore", "upper", None)
+    np.testing.assert_allclose(held.tool_axis, [1, 0, 0])
+    np.testing.assert_allclose(held.point, [0.1, 0, 0])
+    parts = read(tmp_path, "[[task]]\npath = [{ position = [0.7, 0, 0.3], duration = 2.0 }]\n").tasks
+    assert [len(part) for part in parts] == [1]
+    assert parts[0][0].duration == 2.0
+
+
+def test_a_goal_may_carry_a_load_and_tasks_on_the_way(tmp_path: Path) -> None:
+    text = (
+        '[goal]\njoints = { elbow = 1.2 }\nduration = { least = 1, most = 3, guess = 2 }\nname = "lift"\nload = 1.5\n'
+    )
+    text += "path = { direction = [0, 0, 1] }\n[search]\nvelocity = { elbow = 0.1 }\n" + START
+    task = read(tmp_path, text)
+    goal, start = task.tasks, task.options["start"]
+    assert (goal.name, goal.duration) == ("lift", FreeTime(1, 3, 2))
+    assert goal.machine.robot.total_mass == pytest.approx(task.machine.robot.total_mass + 1.5)
+    assert goal.tasks.tilts
+    assert isinstance(start, Start)
+    np.testing.assert_allclose(np.asarray(start.velocity, dtype=float), [np.nan, 0.1, np.nan, np.nan])
+
+
+def test_limits_may_be_robust_and_obstacles_may_move(tmp_path: Path) -> None:
+    text = f'[path]\n{PATH}[limits]\nrobust = {{ payload = 0.5, "tool offset" = 1e-3 }}\n'
+    text += '[[obstacle]]\nshape = "sphere"\nradius = 0.1\nposition = [1, 1, 1]\nvelocity = [0.1, 0, -0.2]\n'
+    options = read(tmp_path, text).options
+    assert options["limits"].robust == {"payload": 0.5, "tool offset": 1e-3}
+    (obstacle,) = options["scene"].obstacles
+    assert isinstance(obstacle, MovingObstacle)
+    np.testing.assert_allclose(np.array(obstacle.position(3.0)).ravel(), [0.3, 0, -0.6])
+
+
+def test_a_standing_robot_has_its_own_cost_rule_and_spring(tmp_path: Path) -> None:
+    rules = {
+        '"anywhere"': Anywhere(), "{ margin = 0.01 }": InFoot(0.01), "{ index = 0.3 }": IndexAtLeast(0.3),
+    }  # fmt: skip
+    stand = 'base = "standing"\nfoot = [-0.2, 0.2, -0.1, 0.1]\n'
+    for text, rule in rules.items():
+        limits = f"[limits]\nzmp = {text}\nvertical_force = 20\n[cost]\nmanipulability = 0.1\n"
+        options = read(tmp_path, f"{stand}[path]\n{PATH}{limits}").options
+        assert (options["limits"].zmp, options["limits"].vertical_force) == (rule, 20.0)
+        assert options["cost"] == Weights(manipulability=0.1)
+    pinned = read(tmp_path, f"{stand}[path]\n{PATH}[limits]\nzmp = {{ point = [0.1, 0.0] }}\n").options["limits"].zmp
+    assert isinstance(pinned, Pinned)
+    np.testing.assert_allclose(pinned.point, [0.1, 0.0])
+    spring = "[scene]\nspring = { stiffness = [100, 0, 0], rest = [0.5, 0, 0] }\n"
+    (wrench,) = read(tmp_path, f"{stand}[path]\n{PATH}{spring}").options["scene"].wrenches(0.0, [0.7, 0.0, 0.0])
+    np.testing.assert_allclose(np.array(wrench.force, dtype=float).ravel(), [-20, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "expected"),
+    [
+        ("robust = { load = 0.5 }", 8, "payload"),
+        ("robust = { payload = -1 }", 8, "payload"),
+        ("zmp = { margin = -1 }", 8, "0 or more, m"),
+        ("zmp = { edge = 1 }", 8, "margin, index, point"),
+        ('zmp = "nowhere"', 8, '"anywhere"'),
+        ("vertical_force = 0", 8, "above 0, N"),
+    ],
+)
+def test_a_mistake_in_the_limits_is_reported_with_its_line(tmp_path: Path, text: str, line: int, expected: str) -> None:
+    with pytest.raises(ProblemError) as caught:
+        read(tmp_path, f"[path]\n{PATH}[limits]\n{text}\n")
+    assert f"task.toml, line {line}," in str(caught.value), str(caught.value)
+    assert expected in str(caught.value)

@@ -12,7 +12,7 @@ import pytest
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.checks import Array
 from models.examples import example_robot
-from ocp import Goal, Limits, Plan, ProblemError, SolveError, console
+from ocp import Goal, Limits, Plan, ProblemError, Scene, SolveError, console
 from ocp import plan as plan_motion
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along
@@ -23,6 +23,7 @@ from ocp.motion.result.candidate import Candidate, Rejection
 from ocp.motion.sampling.joint_paths import StraightMotions
 from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.tasks.goals import Cost
+from scripts.robots.robots import PANDA
 from tests.families import some
 from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider
 
@@ -248,6 +249,26 @@ def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jer
     assert (np.abs(sample.rates) <= machine.robot.velocity * 1.001).all()
     assert np.abs(sample.accelerations).max() <= 10.01
     np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
+
+
+@pytest.mark.long
+def test_the_panda_moves_among_a_wall_a_box_and_a_table_in_the_least_time_of_its_slowest_joint() -> None:
+    """Limits of acceleration and jerk: data sheet; of rates and torques: robot description."""
+    machine, folder = FixedBase(PANDA.read()), str(PANDA.path.parents[3])
+    wall, box = Box((0.5, 0.04, 0.45), (0.6, 0.0, 0.225)), Box((0.2, 0.2, 0.2), (0.45, 0.45, 0.1))
+    scene = Scene([wall, box, Box((1.6, 1.6, 0.05), (0.0, 0.0, -0.06))], clearance=0.01, folders=[folder])
+    start, goal = ([side, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785] for side in (-0.8, 0.8))
+    limits = Limits(
+        acceleration=[15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0],
+        jerk=[7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0],
+    )
+    collisions = StraightMotions(CollisionScene(machine, **scene.collision_options))
+    assert not collisions.are_clear(np.array([start]), np.array([goal]))[0]
+    cost = Cost(velocity=0.0, time=1.0)
+    plan = plan_motion(machine, Goal(joints=goal), start=start, limits=limits, cost=cost, scene=scene)
+    assert plan.audit().feasible
+    assert plan.bound is not None
+    assert plan.bound <= plan.cost <= 1.001 * plan.bound
 
 
 def test_of_many_goals_the_nearest_and_the_most_distant_ones_are_kept() -> None:

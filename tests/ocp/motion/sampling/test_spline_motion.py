@@ -58,9 +58,10 @@ def test_without_obstacles_the_time_is_that_of_the_slowest_joint(jerk: float) ->
     for _ in range(4):
         path = random.uniform(-2, 2, (2, 2))
         limits = limits_of(acceleration=[4.0, 2.0], jerk=jerk)
-        motion = optimal_motion_near(limits, path, TIME)
         least = least_durations(np.abs(path[1] - path[0]), limits.bounds).max()
-        assert least * (1 - 1e-6) <= motion.duration <= 1.01 * least
+        for gain, tolerance in ((SplineMotionSettings.gains[-1], 2e-3), (1e-8, 1e-6)):
+            motion = optimal_motion_near(limits, path, TIME, settings=SplineMotionSettings(gains=(1e-2, gain)))
+            assert motion.duration == pytest.approx(least, rel=tolerance)
         np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-9)
 
 
