@@ -160,15 +160,13 @@ UNBOUND_PREFIX = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
 def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTree.Element:
     """Return the root element of an XML document, after checking that it declares no entities and is not too large.
 
-    Args:
-        data: The document.
-        unbound: If given, elements and attributes below the root whose namespace prefix is not declared are left out,
-            elements with all their contents, and their names are appended to this list. If None, a document with such a
-            prefix is not well-formed.
+    If a list `unbound` is given, elements (with all their contents) and attributes below the root whose namespace
+    prefix is not declared are left out, and their names are appended to it.
 
     Raises:
         ElementTree.ParseError: The document is not well-formed.
-        ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is unknown.
+        ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is
+            unknown.
     """
     content = (
         data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")
@@ -250,12 +248,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key of a result: the hexadecimal SHA-256 digest of the data that determine the result.
-
-    Args:
-        version: Version of the code that computes the result, see `source_version`.
-        contents: Arrays or strings that the result depends on.
-    """
+    """Return the cache key, a SHA-256 digest, of a result of a version of the code from given arrays and strings."""
     digest = hashlib.sha256(version.encode())
     for content in contents:
         data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
@@ -268,7 +261,7 @@ def cache_key(version: str, *contents: Any) -> str:
 def source_version(module: str) -> str:
     """Return a digest of the source of a module and of all modules of its package that it imports, even indirectly.
 
-    So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
+    Imports must be written `from PACKAGE... import`.
     """
     sources: dict[str, str] = {}
     waiting = [module]
@@ -289,10 +282,8 @@ def cache_folder() -> Path:
 
 
 def private_folder(make: bool = False) -> Path:
-    """Return the path of the folder of cached results after checking that only this user can change its contents.
-
-    Args:
-        make: Create the folder if it does not exist.
+    """Return the folder of cached results, created if `make`, after checking that only this user can change its
+    contents.
 
     Raises:
         OSError: There is no folder, it is a link, or another user may change it or a folder above it.
@@ -389,12 +380,10 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 @contextmanager
 def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
-    """Lock a cache key for a `with` block, so that only one process or thread at a time computes the value of the key.
+    """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
 
-    If the lock file cannot be created, the block runs without a lock.
-
-    Args:
-        ask: Called every 20 ms while waiting. It may raise to stop waiting.
+    If the lock file cannot be created, the block runs without a lock. `ask` is called every 20 ms while waiting; it may
+    raise to stop waiting.
     """
     lock = None
     with suppress(*UNREADABLE):
@@ -431,9 +420,7 @@ def _library_name(key: str, library: bytes) -> str:
 
 
 def _evict(newest: Path) -> None:
-    """Remove lock files of ended processes from the disk cache, and the least recently used shared libraries until the
-    others together have at most MAX_LIBRARY_BYTES.
-    """
+    """Remove lock files of ended processes, and the least recently used libraries beyond MAX_LIBRARY_BYTES."""
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use

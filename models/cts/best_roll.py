@@ -1,33 +1,38 @@
-"""Inverse kinematics of the captive trajectory rig at the optimal roll angle, in a bounded number of operations.
+"""Inverse kinematics of the captive trajectory rig at the optimal roll angle, also among obstacles.
 
 The optimal roll on a set of arcs is a stationary point of the index inside an arc, or an end of an arc. Stationary
-points come first: in closed form for I1 (`trigonometric.least_point`), and by Newton's method on intervals of convexity
-for I2, which adds the squared change of roll. If the best of them is within reach and limits, it is globally optimal.
+points are in closed form for I1 (`trigonometric.least_point`), and by Newton's method on intervals of convexity for I2.
+Ends are only computed where a roll outside the arcs costs less.
 
-Otherwise the ends of the arcs matter, and `Search` evaluates them in order until no other can improve. Ends at limits
-of joints 4 to 6 and at the reach of the pitch link have a closed form and are all compared. The others are first
-approximated; one is polished and checked only if a lower bound of the index near it is below the incumbent's. If the
-roll changes from one that violates a limit of joint 1 alone in the direction of increasing index, the first feasible
-roll is at that limit. The ends at a limit of joint 1, which are the most expensive, are therefore computed only if a
-roll better than the incumbent violates that limit.
-
-The functions of the search exchange matrices. Each column holds the scalars of one named tuple.
+Among obstacles, the lowest minima of a grid of rolls and the best roll without obstacles are refined by a pattern
+search. A finer grid finds a minimum that it misses. Either way the number of operations is bounded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models.checks import require
-from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
+from models.checks import require, set_fields
+from models.cts.rig import (
+    HOME,
+    INCH,
+    Branch,
+    Rig,
+    RigConfiguration,
+    Tunnel,
+    checked_branch,
+    configuration_at,
+    dh_frames,
+    joints_of,
+)
 from models.cts.roll import (
-    Candidate,
+    ACTIVE,
+    STATUS,
     check_constraints,
     checked_gain,
     closed_form_ends,
@@ -35,109 +40,17 @@ from models.cts.roll import (
     index_harmonics,
     infeasibility_code,
     inside_limit,
-    level_points,
     limit_code,
-    polish_to_level,
-    polish_to_value,
-    slide_points,
+    slide_ends,
     unwrap_roll,
-    yaw_chart,
-    yaw_levels,
+    yaw_level_ends,
 )
-from models.cts.trigonometric import ROOTS, Harmonics, Point, least_point, polish, roots
+from models.cts.trigonometric import least_point, polish, roots
 from models.errors import ModelError
-from models.spatial import Expression
-
-_Record = TypeVar("_Record")
-
-
-class Incumbent(NamedTuple):
-    """The best feasible roll angle that the search for the rig's optimal roll has found so far.
-
-    Attributes:
-        cost: Value of the index at the roll; inf if there is none yet.
-        c, s: Cosine and sine of the roll.
-        code: Code in roll.ACTIVE of the constraint that is active at the roll.
-        below, above: Least cost of any roll that satisfies all constraints but the lower, or upper, limit of joint 1.
-    """
-
-    cost: Expression
-    c: Expression
-    s: Expression
-    code: Expression
-    below: Expression
-    above: Expression
-
-
-class RoughRoll(NamedTuple):
-    """Approximation of a roll angle that may be optimal, stored as cosine and sine.
-
-    Attributes:
-        bound: Lower bound of the cost near the point; inf if the roll is infeasible.
-        c, s: Cosine and sine.
-        value: Value of cos q2, or of q1 (m), at the polished roll; at a stationary point, the present cos q2.
-        code: Code in roll.ACTIVE of the constraint that is active at the polished roll.
-        side: 1 if the constraint is satisfied above the value, -1 if below.
-    """
-
-    bound: Expression
-    c: Expression
-    s: Expression
-    value: Expression
-    code: Expression
-    side: Expression
-
-
-class Evaluation(NamedTuple):
-    """Cost at a roll angle (inf if pitch reach or joints 4 to 6 exclude it), and the cosine of joint angle 2 there."""
-
-    cost: Expression
-    cos2: Expression
-
-
-class LevelBound(NamedTuple):
-    """A value of cos q2, of joint angle 2, at which a constraint is active, and a lower bound of the cost near it.
-
-    `side` is as in RoughRoll.
-    """
-
-    bound: Expression
-    cosine: Expression
-    code: Expression
-    relevant: Expression
-    side: Expression
-
-
-INCUMBENT_SIZE, SOLUTION_SIZE = len(Incumbent._fields), 9
-NO_INCUMBENT = Incumbent(ca.inf, 1, 0, 0, ca.inf, ca.inf)
-NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
-
-
-class RigSolution(NamedTuple):
-    """Rig's inverse kinematics for one target: joint positions (6, 1), cost, codes of active constraint and status."""
-
-    joints: Expression
-    cost: Expression
-    active: Expression
-    status: Expression
-
-
-def stack(kind: Any, records: Sequence[Any]) -> Expression:
-    """Return named tuples of one class as the columns of a matrix. Shape (fields, records)."""
-    return ca.horzcat(*[ca.vertcat(*record) for record in records]) if records else ca.SX(len(kind._fields), 0)
-
-
-def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
-    """Return the columns of a matrix as named tuples of one class; this is the inverse of `stack`."""
-    return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
-
-
-def _record(kind: Callable[..., _Record], column: Expression) -> _Record:
-    return kind(*ca.vertsplit(column))
-
-
-def _inputs(symbols: Any) -> tuple[Any, Any]:
-    return symbols.sym("target", 5), symbols.sym("previous")
+from models.robot.kinematics import checked_vector
+from models.shapes.distance import column, pair_function, soft_minimum
+from models.shapes.shapes import Box, Capsule
+from models.spatial import FULL_TURN, Expression
 
 
 def optimal_inverse(
@@ -174,316 +87,413 @@ def optimal_inverse(
 
 @lru_cache(maxsize=32)
 def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits: bool) -> Any:
-    search = Search(rig, tunnel, branch, gain)
-    target, previous = _inputs(ca.MX)
-    direct = search.direct()
-    result, done, best, evaluations = direct(target, previous)
-    if limits:
-        search_ends = search.search_ends(direct.size2_out(3))
-        result = evaluate_unless(search_ends, (SOLUTION_SIZE, 1))(done, result, target, previous, best, evaluations)
+    search = _RollSearch(rig, tunnel, branch, gain)
+    target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    solution = (search.best_roll if limits else search.closed_form)()(target, previous)
     name = f"optimal_inverse_{'i2' if gain else 'i1'}{'' if limits else '_free'}"
-    outputs = RigSolution(*ca.vertsplit(result, [0, 6, 7, 8, 9]))
-    return ca.Function(name, [target, previous], list(outputs), ["target", "previous"], list(RigSolution._fields))
+    parts = ca.vertsplit(solution, [0, 6, 7, 8, 9])
+    return ca.Function(name, [target, previous], parts, ["target", "previous"], ["joints", "cost", "active", "status"])
 
 
-@dataclass(frozen=True)
-class Search:
-    """Search for the rig's best roll angle; its methods return the casadi Functions that perform its steps.
+class _RollSearch:
+    """Search for the best roll angle; its methods return casadi Functions of (target, previous roll).
 
-    The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
-    RoughRoll. Their result `answer` is a RigSolution.
-
-    Attributes:
-        gain: Factor w4 / (2 pi) of the squared change of roll in the index I2; 0 for I1.
+    A roll is a column (cosine, sine, code of the active constraint in roll.ACTIVE). A solution is the column (joint
+    positions (6), cost, code in roll.ACTIVE, code in roll.STATUS).
     """
 
-    rig: Rig
-    tunnel: Tunnel
-    branch: Branch
-    gain: float
+    def __init__(self, rig: Rig, tunnel: Tunnel, branch: Branch, gain: float) -> None:
+        self.rig, self.tunnel, self.branch, self.gain = rig, tunnel, branch, gain
+        self.target, self.previous = ca.SX.sym("target", 5), ca.SX.sym("previous")
+        self.inputs = [self.target, self.previous]
+        self.index = index_harmonics(rig, tunnel, self.target)
+        self.is_finite = ca.fabs(ca.sum1(self.target) + self.previous) < ca.inf
 
-    def direct(self) -> Any:
-        """Return the Function that finds the best roll angle among the stationary points of the cost index.
-
-        (target, previous) -> (answer, done, best, evaluations). `done` says that the answer is final: it is within
-        reach and limits, or the input is not finite.
-        """
-        if self.gain:
-            return self._direct_by_descent()
-        target, previous = _inputs(ca.SX)
-        f = self._index(target)
-        c, s = least_point(f)
-        check = check_constraints(self.rig, target, self._configuration(target, c, s), c=c, s=s)
-        best, evaluations, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
+    def closed_form(self) -> Any:
+        """Return the Function that computes the solution at the least index I1 of all rolls."""
+        c, s = least_point(self.index)
+        check = check_constraints(self.rig, self.target, self._configuration(c, s), c=c, s=s)
         angles = ca.logic_and(check.pitch_angles, check.yaw_angles)
-        status = ca.if_else(ca.logic_and(check.slide(), angles), 0, 4)
+        status = ca.if_else(ca.logic_and(check.slide, angles), 0, 4)
         status = ca.if_else(check.pitch, ca.if_else(check.yaw, status, 3), 2)
-        status = ca.if_else(_is_finite(target, previous), status, 1)
-        result = self._solution(target, previous, NO_INCUMBENT._replace(cost=f.value(c, s), c=c, s=s), status)
-        outputs = [result, status <= 1, ca.vertcat(*best), stack(Evaluation, evaluations)]
-        return ca.Function("direct", [target, previous], ca.cse(outputs))
+        status = ca.if_else(self.is_finite, status, 1)
+        solution = self._solution(ca.vertcat(c, s, 0), self.index.value(c, s), status)
+        return ca.Function("closed_form", self.inputs, ca.cse([solution]))
 
-    def _direct_by_descent(self) -> Any:
-        target, previous = _inputs(ca.SX)
-        rolls = ca.SX.sym("rolls", 5)
-        points = [Candidate(ca.cos(rolls[k]), ca.sin(rolls[k]), 0) for k in range(5)]
+    def best_roll(self) -> Any:
+        """Return the Function that computes the solution at the feasible roll of least cost.
+
+        Constraints are added in the order of the effort for the ends of their arcs. After each stage, the least cost of
+        the rolls that satisfy the constraints so far is known; if that roll is feasible, it is optimal.
+        """
+        target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
+        best = self._compare(self._minima())(target, previous, ca.DM([1, 0, 0, *[ca.inf] * 4]))
+        for relaxed_cost, rolls in enumerate((self._pitch_ends(), self._yaw_ends(), self._slide_ends()), start=4):
+            if rolls.size2_out(0):
+                is_optimal = best[relaxed_cost] >= best[3]
+                best = evaluate_unless(self._compare(rolls))(is_optimal, best, target, previous, best)
+        roll, cost = ca.SX.sym("roll", 3), ca.SX.sym("cost")
+        finish = ca.Function("finish", [*self.inputs, roll, cost], ca.cse([self._solution(roll, cost, 0)]))
+        reason = ca.if_else(self.is_finite, infeasibility_code(self.rig, self.target, self.branch), 1)
+        nowhere = ca.vertcat(ca.DM.ones(7) * np.nan, 0, reason)
+        infeasible = evaluate_unless(ca.Function("infeasible", self.inputs, ca.cse([nowhere])))
+        solution = infeasible(best[3] < ca.inf, finish(target, previous, best[:3], best[3]), target, previous)
+        return ca.Function("best_roll", [target, previous], [solution])
+
+    def _minima(self) -> Any:
+        """Return the Function of rolls that include the minimum of the index; for I2, all its minima."""
+        if not self.gain:
+            return ca.Function("minimum", self.inputs, ca.cse([ca.vertcat(*least_point(self.index), 0)]))
+        target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
+        angles = convex_minima(self.rig, self.tunnel, self.gain)(target, previous).T
+        rolls = [ca.vertcat(ca.cos(angles), ca.sin(angles), ca.DM.zeros(1, angles.shape[1]))]
         if np.isfinite(self.rig.limit(6, False)):  # the penalty on the change may drive the roll to a limit of joint 6
             for upper in (False, True):
                 angle = inside_limit(self.rig, 6, upper)
-                points.append(Candidate(np.cos(angle), np.sin(angle), limit_code(6, upper)))
-        best, evaluations, least = self._compare(target, previous, points, NO_INCUMBENT)
-        number = _is_finite(target, previous)
-        result = self._solution(target, previous, best, ca.if_else(number, 0, 1))
-        done = ca.logic_or(ca.logic_and(least >= best.cost, best.cost < ca.inf), ca.logic_not(number))
-        outputs = [result, done, ca.vertcat(*best), stack(Evaluation, evaluations)]
-        settle = ca.Function("settle", [target, previous, rolls], ca.cse(outputs))
-        x, before = _inputs(ca.MX)
-        settled = settle(x, before, convex_minima(self.rig, self.tunnel, self.gain)(x, before))
-        return ca.Function("direct", [x, before], list(settled))
+                rolls.append(ca.DM([np.cos(angle), np.sin(angle), limit_code(6, upper)]))
+        return ca.Function("minima", [target, previous], [ca.horzcat(*rolls)])
 
-    def search_ends(self, count: int) -> Any:
-        """Return the Function that searches the ends of feasible roll intervals for a roll better than the incumbent.
-
-        (target, previous, best, `count` evaluations) -> answer.
+    def _pitch_ends(self) -> Any:
+        """Return the Function of the arcs' ends due to the pitch link and joints 4 to 6, for I1 with the other
+        stationary rolls.
         """
-        target, previous = _inputs(ca.MX)
-        first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
-        best, more = self._cheap_ends()(target, previous, first)
-        columns = [evaluations, more]
-        chart = yaw_chart(self.rig, self.branch)
+        rolls = [ca.vertcat(*end) for end in closed_form_ends(self.rig, self.target, self.branch)]
         if not self.gain:
-            rough = self._rough_stationary()(target)
-            best = self._improve(self._stationary, 4)(target, previous, rough, best)
-            points = [Evaluation(point.bound, point.value) for point in unstack(RoughRoll, rough)]
-            columns.append(stack(Evaluation, points))
-        evaluations = ca.horzcat(*columns)
-        best = self._yaw_level_ends(chart, evaluations.shape[1])(target, previous, evaluations, best)
-        for upper in (False, True):
-            if np.isfinite(self.rig.limit(1, upper)):
-                incumbent = _record(Incumbent, best)
-                settled = (incumbent.above if upper else incumbent.below) >= incumbent.cost
-                best = evaluate_unless(self._slide_ends(chart, upper))(settled, best, target, previous, best)
-        answer, solved = self._finish()(target, previous, best), _record(Incumbent, best).cost < ca.inf
-        result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
-        return ca.Function("thorough", [target, previous, first, columns[0]], [result])
+            slope = self.index.derivative()
+            bend = slope.derivative()
+            for point in roots(slope, steps=0):
+                rolls.append(ca.vertcat(*polish(point, lambda c, s: (slope.value(c, s), bend.value(c, s))), 0))
+        return ca.Function("pitch_ends", self.inputs, ca.cse([ca.horzcat(*rolls)]))
 
-    def _cheap_ends(self) -> Any:
-        """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
+    def _yaw_ends(self) -> Any:
+        """Return the Function of the arcs' ends at the reach of the yaw link and the limits of joints 2 and 3."""
+        ends = [ca.vertcat(*end) for end in yaw_level_ends(self.rig, self.target, self.branch)]
+        return ca.Function("yaw_ends", self.inputs, ca.cse([ca.horzcat(*ends)]))
 
-        (target, previous, best) -> (best, evaluations).
+    def _slide_ends(self) -> Any:
+        """Return the Function of the arcs' ends at the limits of joint 1."""
+        target, previous = ca.MX.sym("target", 5), ca.MX.sym("previous")
+        return ca.Function("slide_ends", [target, previous], [slide_ends(self.rig, self.branch)(target)])
+
+    def _compare(self, rolls: Any) -> Any:
+        """Return the Function (target, previous, best) -> best that compares the best roll so far with others.
+
+        `best` is the column (roll (3), its cost, least costs of any roll, of rolls with reachable pitch, and of rolls
+        that violate at most the limits of joint 1).
         """
-        target, previous = _inputs(ca.SX)
-        first = ca.SX.sym("best", INCUMBENT_SIZE)
-        ends = closed_form_ends(self.rig, target, self.branch)
-        best, evaluations, _ = self._compare(target, previous, ends, _record(Incumbent, first))
-        return ca.Function(
-            "simple", [target, previous, first], ca.cse([ca.vertcat(*best), stack(Evaluation, evaluations)])
-        )
+        roll = ca.SX.sym("roll", 3)
+        c, s, _ = ca.vertsplit(roll)
+        cost = self.index.value(c, s)
+        if self.gain:
+            cost += self.gain * (unwrap_roll(self.rig, c, s, self.previous) - self.previous) ** 2
+        check = check_constraints(self.rig, self.target, self._configuration(c, s), c=c, s=s)
+        all_but_slide = check.all_but_slide()
+        feasible = ca.logic_and(all_but_slide, check.slide)
+        costs = [ca.if_else(holds, cost, ca.inf) for holds in (feasible, 1, check.is_pitch_reachable(), all_but_slide)]
+        evaluate = ca.Function("costs", [*self.inputs, roll], ca.cse([ca.vertcat(*costs)]))
 
-    def _rough_stationary(self) -> Any:
-        """Return the Function that approximates the roll angles at which the cost index I1 is stationary.
+        target, previous, best = ca.MX.sym("target", 5), ca.MX.sym("previous"), ca.MX.sym("best", 7)
+        points = rolls(target, previous)
+        levels = ca.horzcat(best[3:], evaluate.map(points.shape[1])(target, previous, points))
+        points = ca.horzcat(best[:3], points)
+        lowest, least = select_lowest(3, points.shape[1])(points, levels[0, :])
+        relaxed = [ca.mmin(levels[k, :]) for k in (1, 2, 3)]
+        return ca.Function("compare", [target, previous, best], [ca.vertcat(lowest, least, *relaxed)])
 
-        (target) -> rough; NO_ROLL if there is only one minimum. In the axes of trigonometric.least_point there are only
-        two stationary points outside the astroid |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4
-        r encloses.
-        """
-        target, _ = _inputs(ca.SX)
-        rough, f = self._approximation(target), self._index(target)
-        points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
-        approximate = ca.Function("rough", [target], ca.cse([stack(RoughRoll, points)]))
-        first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
-        one_minimum = ca.Function("one_minimum", [target], [first > 4 * second])
-        x, no_points = ca.MX.sym("target", 5), stack(RoughRoll, [NO_ROLL] * len(points))
-        answer = evaluate_unless(approximate, no_points.shape)(one_minimum(x), no_points, x)
-        return ca.Function("rough_stationary", [x], [answer])
+    def _configuration(self, c: Expression, s: Expression) -> RigConfiguration:
+        return configuration_at(self.rig, self.target, c, s, branch=self.branch)
 
-    def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function that searches the ends of feasible roll intervals that are due to yaw joints 2 and 3.
-
-        (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
-        evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
-        limit of joint 1 alone, since its arc may end before that limit is satisfied.
-        """
-        target, _ = _inputs(ca.SX)
-        rolls = ca.SX.sym("seen", len(Evaluation._fields), count)
-        levels, (_, slack) = [], self._slack()
-        for level in yaw_levels(self.rig, target, self.branch):
-            bound = ca.SX(ca.inf)
-            for roll in unstack(Evaluation, rolls):
-                over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
-                bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
-            bound = ca.if_else(level.relevant, bound, ca.inf)
-            levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
-        needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
-
-        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._approximation(target)
-        _, cosine, code, _, side = _record(LevelBound, suspect)
-        ends = level_points(self.rig, target, cosine)
-        points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
-        near_level = ca.Function("rough", [target, suspect], ca.cse([stack(RoughRoll, points)]))
-
-        def polished(at: Expression, end: RoughRoll) -> Point:
-            return polish_to_level(self.rig, chart, at, value=end.value, above=end.side, point=(end.c, end.s))
-
-        x, before = _inputs(ca.MX)
-        first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
-        answer = self._improve(polished, len(points))(x, before, near_level(x, column), first)
-        search_level = evaluate_unless(ca.Function("level", [x, before, column, first], [answer]))
-        evaluations = ca.MX.sym("seen", *rolls.shape)
-        best = first
-        for level in ca.horzsplit(needed(x, evaluations)):
-            settled = _record(LevelBound, level).bound >= _record(Incumbent, best).cost
-            best = search_level(settled, best, x, before, level, best)
-        if np.isfinite([self.rig.limit(1, False), self.rig.limit(1, True)]).any():
-            for level in ca.horzsplit(needed(x, evaluations)):
-                incumbent, relevant = _record(Incumbent, best), _record(LevelBound, level).relevant
-                cannot_improve = ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost
-                settled = ca.logic_or(cannot_improve, ca.logic_not(relevant))
-                best = search_level(settled, best, x, before, level, best)
-        return ca.Function("levels", [x, before, evaluations, first], [best])
-
-    def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function that compares the incumbent with roll angles that put prismatic joint 1 at a limit.
-
-        (target, previous, best) -> best.
-        """
-        target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-        rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
-        datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
-        ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
-        near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
-
-        def polished(at: Expression, end: RoughRoll) -> Point:
-            return polish_to_value(chart, at, 2, value=end.value, point=(end.c, end.s))
-
-        x, before = _inputs(ca.MX)
-        best = ca.MX.sym("best", INCUMBENT_SIZE)
-        answer = self._improve(polished, len(ends))(x, before, near_limit(x, slide_points(self.rig, upper)(x)), best)
-        return ca.Function("slide", [x, before, best], [answer])
-
-    def _slack(self) -> tuple[float, float]:
-        """Return bounds of changes of sin q4 and cos q2 (joint angles) as the roll changes by ROOTS.root_tolerance."""
-        rig = self.rig
-        sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
-        cos4 = float(np.sqrt(2 * sin4)) + sin4
-        return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
-
-    def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that computes a lower bound of the cost index near an approximate roll angle.
-
-        `about` = (middle, half width) is the range of cos q2 outside of which the bound is inf.
-        """
-        f, (slack4, _) = self._index(target), self._slack()
-        slack = ROOTS.root_tolerance * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
-
-        def rough(
-            c: Expression, s: Expression, value: Expression = None, code: Any = 0, side: Any = 0, about: Any = None
-        ) -> RoughRoll:
-            configuration = self._configuration(target, c, s)
-            is_near = ca.fabs(configuration.sin4) < 1 + slack4
-            if about is not None:
-                is_near = ca.logic_and(is_near, ca.fabs(configuration.cos2 - about[0]) < about[1])
-            bound = ca.if_else(is_near, f.value(c, s) - slack, ca.inf)
-            return RoughRoll(bound, c, s, configuration.cos2 if value is None else value, code, side)
-
-        return rough
-
-    def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function that refines `count` approximate roll angles and compares them with the incumbent.
-
-        (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
-        """
-        target, previous = _inputs(ca.SX)
-        rough, first = ca.SX.sym("rough", len(RoughRoll._fields)), ca.SX.sym("best", INCUMBENT_SIZE)
-        point = _record(RoughRoll, rough)
-        candidate = Candidate(*polished(target, point), point.code)
-        best, _, _ = self._compare(target, previous, [candidate], _record(Incumbent, first))
-        sharpen = ca.Function("sharpen", [target, previous, rough, first], ca.cse([ca.vertcat(*best)]))
-
-        target, previous = _inputs(ca.MX)
-        first, rough = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("rough", len(RoughRoll._fields), count)
-        gate, column = evaluate_unless(sharpen), first
-        for point in ca.horzsplit(rough):
-            settled = _record(RoughRoll, point).bound >= _record(Incumbent, column).cost
-            column = gate(settled, column, target, previous, point, column)
-        return ca.Function("gates", [target, previous, rough, first], [column])
-
-    def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of the cost index I1 near an approximate roll angle, by Newton's method."""
-        slope = self._index(target).derivative()
-        bend = slope.derivative()
-        return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
-
-    def _compare(
-        self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
-    ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare given rolls with the incumbent; return the best roll, and evaluations and least cost of the given
-        rolls.
-
-        The result is (Incumbent, list of Evaluation, cost).
-        """
-        f = self._index(target)
-        cost, c, s, code, below, above = best
-        least, evaluations = ca.SX(ca.inf), []
-        for point in points:
-            value = f.value(point.c, point.s)
-            if self.gain:
-                value += self.gain * (unwrap_roll(self.rig, point.c, point.s, previous) - previous) ** 2
-            configuration = self._configuration(target, point.c, point.s)
-            check = check_constraints(self.rig, target, configuration, c=point.c, s=point.s)
-            all_but_slide = check.all_but_slide()
-            better = ca.logic_and(ca.logic_and(all_but_slide, check.slide()), value < cost)
-            least = ca.fmin(least, value)
-            evaluations.append(Evaluation(ca.if_else(check.is_pitch_reachable(), value, ca.inf), configuration.cos2))
-            over = ca.if_else(all_but_slide, value, ca.inf)
-            below = ca.fmin(below, ca.if_else(check.slide_lower, ca.inf, over))
-            above = ca.fmin(above, ca.if_else(check.slide_upper, ca.inf, over))
-            cost = ca.if_else(better, value, cost)
-            c, s = ca.if_else(better, point.c, c), ca.if_else(better, point.s, s)
-            code = ca.if_else(better, point.code, code)
-        return Incumbent(cost, c, s, code, below, above), evaluations, least
-
-    def _index(self, target: Expression) -> Harmonics:
-        return index_harmonics(self.rig, self.tunnel, target)
-
-    def _configuration(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
-        return configuration_at(self.rig, target, c, s, branch=self.branch)
-
-    def _finish(self) -> Any:
-        """Return the Function of target, previous roll and incumbent that computes joint positions at the incumbent."""
-        target, previous = _inputs(ca.SX)
-        best = ca.SX.sym("best", INCUMBENT_SIZE)
-        answer = self._solution(target, previous, _record(Incumbent, best), 0)
-        return ca.Function("finish", [target, previous, best], ca.cse([answer]))
-
-    def _infeasible(self) -> Any:
-        """Return the Function that reports an infeasible target by joint positions nan and the reason as status."""
-        target = ca.SX.sym("target", 5)
-        result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
-        return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
-
-    def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return joints, cost and status of the wind-tunnel rig at the best roll angle so far, as a column (9, 1)."""
-        roll = unwrap_roll(self.rig, best.c, best.s, previous)
-        joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
+    def _solution(self, roll: Expression, cost: Expression, status: Expression) -> Expression:
+        c, s, code = ca.vertsplit(roll)
+        joints = joints_of(self.rig, self.target, unwrap_roll(self.rig, c, s, self.previous), self._configuration(c, s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
-        return ca.vertcat(*RigSolution(joints + spoilt, best.cost + spoilt, best.code, status))
+        return ca.vertcat(joints + spoilt, cost + spoilt, code, status)
 
 
-def _is_finite(target: Expression, previous: Expression) -> Expression:
-    """Return whether all entries of the target and the previous roll angle are finite."""
-    total = ca.sum1(target) + previous
-    return ca.fabs(total) < ca.inf
+def select_lowest(size: int, count: int) -> Any:
+    """Return the casadi Function (columns, values) -> (first column of least value, least value)."""
+    columns, values = ca.SX.sym("columns", size, count), ca.SX.sym("values", 1, count)
+    best, least = columns[:, 0], values[0]
+    for k in range(1, count):
+        best, least = ca.if_else(values[k] < least, columns[:, k], best), ca.fmin(values[k], least)
+    return ca.Function("select_lowest", [columns, values], [best, least])
 
 
-def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
-    """Return a Function that returns a known value if a condition holds, and otherwise evaluates another Function.
+def evaluate_unless(alternative: Any) -> Any:
+    """Return the Function (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments).
 
-    (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments). The alternative is only
-    evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
+    The alternative is only evaluated if needed; casadi.if_else would also evaluate what its arguments depend on.
     """
-    known = ca.MX.sym("known", *shape)
+    known = ca.MX.sym("known", *alternative.size_out(0))
     inputs = [ca.MX.sym(f"x{i}", alternative.sparsity_in(i)) for i in range(alternative.n_in())]
     keep = ca.Function("keep", [known, *inputs], [known])
     call = ca.Function("call", [known, *inputs], alternative.call(inputs))
     return ca.Function.if_else("choose", keep, call)
+
+
+class LinkCapsule(NamedTuple):
+    """A capsule that represents a link of the rig: its radius, m, and the world positions of its ends, (3, 1), m."""
+
+    radius: float
+    start: Expression
+    end: Expression
+
+
+def _distance_to_walls(capsule: LinkCapsule, walls: Box) -> Expression:
+    """Return the signed distance of a capsule inside a hollow box from the nearest wall of the box. Shape (1, 1), m."""
+    finite = np.flatnonzero(np.isfinite(walls.size)).tolist()
+    axes, half = ca.DM(walls.rotation[:, finite].T), ca.DM(walls.size[finite] / 2)
+    ends = (ca.mtimes(axes, end - ca.DM(walls.position)) for end in (capsule.start, capsule.end))
+    return ca.mmin(ca.vertcat(*(half - ca.fabs(end) for end in ends))) - capsule.radius
+
+
+@dataclass(frozen=True)
+class ClearanceSearch:
+    """Settings of the search for the roll angle of least cost at which the rig collides with nothing.
+
+    Attributes:
+        samples: Number of rolls in the grid.
+        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
+        minima: Number of local minima on the grid that are refined.
+        steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes: 0.62^44 = 7e-10
+            of the grid's.
+        penalty: Penalty on missing clearance in the merit function, 1/m.
+        inset: Distance beyond the least clearance that the search aims for, m.
+        active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
+    """
+
+    samples: int = 72
+    softness: float = 2e-3
+    minima: int = 4
+    steps: int = 44
+    shrink: float = 0.62
+    penalty: float = 1e3
+    inset: float = 1e-10
+    active_tolerance: float = 1e-6
+
+
+SEARCH = ClearanceSearch()
+
+
+@dataclass(frozen=True)
+class Radii:
+    """Radii of the capsules that represent yaw links, pitch link, goose-neck and sting of the rig, m."""
+
+    yaw: float = 2.0 * INCH
+    pitch: float = 1.5 * INCH
+    sting: float = 0.75 * INCH
+
+    def __post_init__(self) -> None:
+        for what, radius in vars(self).items():
+            require.nonnegative(f"radii: {what}", radius, unit="m")
+
+
+@dataclass(frozen=True)
+class CollisionScene:
+    """Obstacles around the rig: tunnel walls, boxes and capsules.
+
+    Attributes:
+        walls: The hollow tunnel, a box whose edges may be infinite; its floor is a wall. None for no walls.
+        solids: Boxes with finite edges, such as fittings of the floor and the parent aircraft.
+        capsules: Capsules in world.
+    """
+
+    walls: Box | None = None
+    solids: tuple[Box, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.walls is not None:
+            require.instance("scene: walls", self.walls, Box)
+        for what, kind in (("solids", Box), ("capsules", Capsule)):
+            set_fields(self, **{what: require.each(f"scene: {what}", getattr(self, what), kind)})
+
+
+def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
+    """Return the capsules that represent the rig's links, from yaw link 1 to the sting, by name of the link."""
+    require.instance("rig: rig", rig, Rig)
+    radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
+    frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
+    joint2, joint3, joint4 = (frames[k].position for k in (1, 2, 3))
+    side = frames[3].point((0, 0, rig.yaw_offset))
+    corner, tool = frames[4].position, frames[7]
+    behind = tool.point((-rig.sting, 0, 0))
+    return {
+        "yaw link 1": LinkCapsule(radii.yaw, joint2, joint3),
+        "yaw link 2": LinkCapsule(radii.yaw, joint3, joint4),
+        "yaw offset": LinkCapsule(radii.yaw, joint4, side),
+        "pitch link": LinkCapsule(radii.pitch, side, corner),
+        "goose-neck": LinkCapsule(radii.sting, corner, behind),
+        "sting": LinkCapsule(radii.sting, behind, tool.position),
+    }
+
+
+def clearances(
+    rig: Rig, q: Expression, scene: CollisionScene, radii: Radii | None = None
+) -> dict[tuple[str, str], Expression]:
+    """Return the signed distance of every link from every obstacle, keyed by (link, obstacle). Shape (1, 1) each, m.
+
+    Raises:
+        ModelError: The scene is empty, or a solid box has an infinite edge.
+    """
+    require.instance("clearances: scene", scene, CollisionScene)
+    distances: dict[tuple[str, str], Expression] = {}
+    for name, capsule in rig_capsules(rig, q, radii).items():
+        own = ca.vertcat(capsule.start, capsule.end, capsule.radius)
+        if scene.walls is not None:
+            distances[name, "walls"] = _distance_to_walls(capsule, scene.walls)
+        obstacles: dict[str, Box | Capsule] = {f"solid {k}": box for k, box in enumerate(scene.solids)}
+        obstacles |= {f"capsule {k}": obstacle for k, obstacle in enumerate(scene.capsules)}
+        for label, obstacle in obstacles.items():
+            distances[name, label] = pair_function(Capsule, type(obstacle))(own, column(obstacle))
+    if not distances:
+        message = "clearances: the scene is empty; give walls, solids or capsules"
+        raise ModelError(message, name="scene", value=scene)
+    return distances
+
+
+def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
+    """Return a cost term that grows as the gap between rig and obstacles closes: weight exp(-gap / width), both in m.
+
+    Raises:
+        ModelError: The weight is negative or not finite, or the width is not positive.
+    """
+    require.nonnegative("clearance: weight", weight)
+    require.positive("clearance: width", width, unit="m")
+    return weight * ca.exp(-gap / width)
+
+
+def checked_clearance(clearance: float) -> float:
+    """Return a required clearance, m; raise a ModelError unless it is finite, or -inf for no constraint."""
+    if require.number("rig: clearance", clearance, finite=False) == np.inf:
+        message = f"clearance {clearance} m must be a finite distance or -inf for none"
+        raise ModelError(message, name="clearance", value=clearance)
+    return clearance
+
+
+@dataclass(frozen=True)
+class Avoidance:
+    """Settings of obstacle avoidance for the rig: clearance as a constraint, as a term of the cost index, or both.
+
+    Attributes:
+        scene: Obstacles.
+        clearance: Least distance of the rig from the scene, m; -inf for no constraint.
+        weight, width: Weight and width (m) of the term weight exp(-gap / width) of the index.
+        radii: Radii of the rig's capsules; the default ones if None.
+
+    Raises:
+        ModelError: A clearance that is nan or inf, a negative weight, a width that is not positive.
+    """
+
+    scene: CollisionScene
+    clearance: float = -np.inf
+    weight: float = 0.0
+    width: float = 0.05
+    radii: Radii | None = None
+
+    def __post_init__(self) -> None:
+        require.instance("avoidance: scene", self.scene, CollisionScene)
+        checked_clearance(self.clearance)
+        require.nonnegative("avoidance: weight", self.weight)
+        require.positive("avoidance: width", self.width, unit="m")
+        if self.radii is not None:
+            require.instance("avoidance: radii", self.radii, Radii)
+
+
+def collision_free_inverse(
+    rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
+) -> Any:
+    """Return the casadi Function that computes the joint positions for a target at the best collision-free roll angle.
+
+    Args:
+        avoidance: Obstacles, clearance and proximity term.
+        rate_weight: w4 of I2; 0 for I1.
+
+    Returns:
+        The Function (target, previous) -> (joints, cost, active, status, gap): the outputs of `optimal_inverse` and
+            the smooth least distance, m. `active` is "clearance" if this constraint is active, else as at the roll
+            without obstacles if that is the best, else "free". The status "clearance" means that every roll within
+            the limits collides.
+
+    Raises:
+        ModelError: The rate weight is out of range, or the scene is empty.
+    """
+    gain = checked_gain(rate_weight)
+    require.instance("rig: rig", rig, Rig)
+    require.instance("rig: tunnel", tunnel, Tunnel)
+    branch = checked_branch(branch)
+    clearance = require.instance("rig: avoidance", avoidance, Avoidance).clearance
+    samples = SEARCH.samples
+    target, previous, angle = ca.SX.sym("target", 5), ca.SX.sym("previous"), ca.SX.sym("angle")
+    c, s = ca.cos(angle), ca.sin(angle)
+    configuration = configuration_at(rig, target, c, s, branch=branch)
+    roll = unwrap_roll(rig, c, s, previous)
+    joints = joints_of(rig, target, roll, configuration)
+    gap = soft_minimum(list(clearances(rig, joints, avoidance.scene, avoidance.radii).values()), SEARCH.softness)
+    cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
+    cost += proximity_cost(gap, avoidance.weight, avoidance.width)
+    check = check_constraints(rig, target, configuration, c=c, s=s)
+    within_limits = ca.logic_and(check.all_but_slide(), check.slide)
+    feasible = ca.logic_and(within_limits, gap >= clearance)
+    inputs = [target, previous, angle]
+    value = ca.Function("value", inputs, ca.cse([ca.if_else(feasible, cost, ca.inf)]))
+    short: Any = ca.fmax(clearance + SEARCH.inset - gap, 0) if np.isfinite(clearance) else 0.0
+    penalised = ca.if_else(within_limits, cost + SEARCH.penalty * short, ca.inf)
+    merit = ca.Function("merit", inputs, ca.cse([penalised]))
+    joints_and_gap = ca.Function("joints_and_gap", inputs, ca.cse([joints, gap]))
+
+    x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")
+    closed, _, closed_active, closed_status = optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight)(x, before)
+    reached = closed_status == 0
+    closed_roll = ca.if_else(reached, closed[5], 0.0)
+    grid = ca.DM(np.linspace(-np.pi, np.pi, samples, endpoint=False)).T
+    starts = ca.Function("starts", *_grid_minima(samples))(merit.map(samples)(x, before, grid))
+    states = ca.horzcat(starts, ca.vertcat(closed_roll, merit(x, before, closed_roll), FULL_TURN / samples))
+    refined = _pattern_search(merit)(states, ca.repmat(ca.vertcat(x, before), 1, SEARCH.minima + 1))
+    count = SEARCH.minima + 2
+    angles = ca.horzcat(closed_roll, refined[0, :])
+    codes = ca.horzcat(closed_active, ca.DM.zeros(1, count - 1))
+    best, least = select_lowest(2, count)(ca.vertcat(angles, codes), value.map(count)(x, before, angles))
+    q, distance = joints_and_gap(x, before, best[0])
+    status = ca.if_else(reached, ca.if_else(least < ca.inf, 0, STATUS.index("clearance")), closed_status)
+    invalid = ca.if_else(status == 0, 0, np.nan)
+    active = ca.if_else(distance - clearance < SEARCH.active_tolerance, ACTIVE.index("clearance"), best[1])
+    outputs = [q + invalid, least + invalid, active, status, distance + invalid]
+    labels = ["target", "previous"], ["joints", "cost", "active", "status", "gap"]
+    return ca.Function("collision_free_inverse", [x, before], outputs, *labels)
+
+
+def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
+    """Return inputs and outputs of the Function (merits on a grid) -> lowest minima, columns (angle, merit, step)."""
+    merits = ca.SX.sym("merits", 1, samples)
+    angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
+    remaining = []
+    for k in range(samples):
+        is_minimum = ca.logic_and(merits[k] <= merits[k - 1], merits[k] <= merits[(k + 1) % samples])
+        remaining.append(ca.if_else(is_minimum, merits[k], ca.inf))
+    columns = []
+    for _ in range(SEARCH.minima):
+        best, least = ca.SX(0), ca.SX(ca.inf)
+        for angle, merit in zip(angles, remaining, strict=True):
+            best, least = ca.if_else(merit < least, angle, best), ca.fmin(merit, least)
+        remaining = [ca.if_else(best == angle, ca.inf, merit) for angle, merit in zip(angles, remaining, strict=True)]
+        columns.append(ca.vertcat(best, least, FULL_TURN / samples))
+    return [merits], [ca.horzcat(*columns)]
+
+
+def _pattern_search(merit: Any) -> Any:
+    """Return the Function (states, inputs) -> states that minimises the merit by pattern searches from several roll
+    angles.
+
+    A state is (angle, merit, step); the inputs are target and previous roll.
+    """
+    state, inputs = ca.MX.sym("state", 3), ca.MX.sym("inputs", 6)
+    angle, least, step = ca.vertsplit(state)
+    for side in (-0.5, 0.5):
+        trial = state[0] + side * step
+        value = merit(inputs[:5], inputs[5], trial)
+        better = value < least
+        angle, least = ca.if_else(better, trial, angle), ca.if_else(better, value, least)
+    once = ca.Function("once", [state, inputs], [ca.vertcat(angle, least, step * SEARCH.shrink)])
+    last = once.mapaccum(SEARCH.steps)(state, ca.repmat(inputs, 1, SEARCH.steps))[:, -1]
+    return ca.Function("pattern", [state, inputs], [last]).map(SEARCH.minima + 1)

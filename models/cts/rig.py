@@ -16,7 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, Sign, require, warn_of_degrees, warn_of_millimetres
+from models.checks import Array, ArrayInput, Sign, require, set_fields, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
@@ -54,10 +54,10 @@ class Rig:
     def __post_init__(self) -> None:
         for name in LENGTHS:
             length = require.positive(f"rig: {name}", getattr(self, name), unit="m")
-            object.__setattr__(self, name, length)
+            set_fields(self, **{name: length})
             warn_of_millimetres(f"rig: {name}", length)
         for name in ("lower", "upper"):
-            object.__setattr__(self, name, require.array(f"rig: {name}", getattr(self, name), (6,), entries="numbers"))
+            set_fields(self, **{name: require.array(f"rig: {name}", getattr(self, name), (6,), entries="numbers")})
         for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
             if not low < high:
                 message = f"rig: joint {joint} has lower limit {low} not below its upper limit {high}"
@@ -106,7 +106,7 @@ class Tunnel:
     def __post_init__(self) -> None:
         signs: dict[str, Sign] = {"center": "any", "ranges": "positive", "weights": "nonnegative"}
         for name, sign in signs.items():
-            object.__setattr__(self, name, require.array(f"tunnel: {name}", getattr(self, name), (3,), sign=sign))
+            set_fields(self, **{name: require.array(f"tunnel: {name}", getattr(self, name), (3,), sign=sign)})
 
     @property
     def scale(self) -> Array:
@@ -154,12 +154,8 @@ class RigConfiguration(NamedTuple):
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
-    """Return link frames 0 to 6 and the tool frame in the world as products of Denavit-Hartenberg transformations.
-
-    Equations (1) to (4) of the paper, without joint offsets.
-
-    Args:
-        q: Joint positions. Shape (6, 1).
+    """Return link frames 0 to 6 and the tool frame in world by Denavit-Hartenberg products, equations (1) to (4), for
+    joints q.
     """
     q = expression(q)
     rows = (
@@ -181,9 +177,8 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the pose (x, y, z, yaw, pitch, roll) of the tool frame in the world. Shape (6, 1), m and rad.
-
-    Equations (16) to (22) of the paper. Yaw and pitch are the sums of the joint angles, not reduced to one turn.
+    """Return the pose (x, y, z, yaw, pitch, roll) of the tool in world, equations (16) to (22). Shape (6, 1), m and
+    rad.
     """
     q = expression(q)
     (c23, s23), (c45, s45), (c6, s6) = ((ca.cos(x), ca.sin(x)) for x in (q[1] + q[2], q[3] + q[4], q[5]))
@@ -200,19 +195,15 @@ def forward(rig: Rig, q: Expression) -> Expression:
 
 
 def task_jacobian(rig: Rig, q: Expression) -> Expression:
-    """Return the Jacobian (Table 3 of Lee, Lee 2017) of the target coordinates with respect to the joint positions.
-
-    The target coordinates are (x, y, z, yaw, pitch). Shape (5, 6).
-    """
+    """Return the Jacobian of the target (x, y, z, yaw, pitch) with respect to the joints, Table 3. Shape (5, 6)."""
     joints = ca.SX.sym("q", 6)
     jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
     return jacobian(q)
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
-    """Return the position of the goose-neck's corner in the world for a target and a roll angle. Shape (3, 1), m.
-
-    Equations (32) to (34) of the paper.
+    """Return the goose-neck's corner in world for a target and a roll, equations (32) to (34) of the paper. Shape (3,
+    1), m.
     """
     roll = expression(roll)
     return corner_of_roll(rig, expression(target), ca.cos(roll), ca.sin(roll))

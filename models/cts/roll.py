@@ -1,13 +1,12 @@
 """Feasible roll angles of the rig for a target, and the cost indices I1 and I2 by which they are compared.
 
-The roll is the rotation of the store about the tool axis, which the task leaves free. At a given target, that is
-position, yaw and pitch, it determines the positions of all joints up to the branch. It is represented as a point
-(cosine, sine) of the unit circle. The feasible rolls, within reach of both links and within the joint limits, form a
-set of arcs. Every end of an arc is a root of a trigonometric polynomial of degree 1 (joints 4 and 5 and the reach of
-the pitch link), 2 (joints 2 and 3 and the reach of the yaw link) or 4 (joint 1).
+The roll is the rotation of the store about the tool axis, which the task leaves free. At a given target it determines
+all joints up to the branch. It is represented as a point (cosine, sine) of the unit circle. The feasible rolls form
+arcs whose ends are roots of trigonometric polynomials of degree 1 (joints 4 and 5 and the reach of the pitch link), 2
+(joints 2 and 3 and the reach of the yaw link) or 4 (joint 1).
 
-The index I2 = I1 + w4 / (2 pi) (roll - previous)^2, equation (37) of Lee, Lee 2017, also depends on the turn of a roll.
-Its minima are found by Newton's method on intervals of convexity, which at most four roots of I1'' + const delimit.
+I2 = I1 + w4 / (2 pi) (roll - previous)^2, equation (37) of Lee, Lee 2017, has its minima on intervals of convexity,
+which at most four roots of I1'' + const delimit.
 """
 
 from __future__ import annotations
@@ -62,8 +61,6 @@ ANGLE_INSET is in rad or m, REACH_INSET applies to a sine or cosine.
 SQUARED_POLISH_STEP = 1e-5
 SINE_ROUNDING = 2e-15
 """Upper bound of the rounding error of sin q4."""
-COSINE_SLACK = 1e-7
-"""Tolerance of the cosine by which a joint limit is checked at a possible end of a roll interval."""
 
 
 class Candidate(NamedTuple):
@@ -81,8 +78,7 @@ class ConstraintCheck(NamedTuple):
     yaw: Expression
     pitch_angles: Expression
     yaw_angles: Expression
-    slide_lower: Expression
-    slide_upper: Expression
+    slide: Expression
 
     def all_but_slide(self) -> Expression:
         """Return whether all reach constraints and joint limits but those of joint 1 (the slide) are satisfied."""
@@ -92,10 +88,6 @@ class ConstraintCheck(NamedTuple):
         """Return whether the rig's pitch link reaches the target, with joints 4 to 6 inside their limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
-    def slide(self) -> Expression:
-        """Return whether joint 1 (the slide) is within its limits."""
-        return ca.logic_and(self.slide_lower, self.slide_upper)
-
 
 class ArcEndLevel(NamedTuple):
     """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end.
@@ -104,13 +96,11 @@ class ArcEndLevel(NamedTuple):
         cosine: The value.
         code: Code of the constraint, in ACTIVE.
         above: Whether the constraint is satisfied above the value, not below.
-        relevant: Whether joints 2 and 3 are within their limits at the value, in the given branch.
     """
 
     cosine: Expression
     code: int
     above: bool
-    relevant: Expression
 
 
 def limit_code(joint: int, upper: bool) -> int:
@@ -119,10 +109,7 @@ def limit_code(joint: int, upper: bool) -> int:
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1, a squared distance from the tunnel's centre, as harmonics of the roll angle.
-
-    Equation (36) of Lee, Lee 2017.
-    """
+    """Return the cost index I1, equation (36) of Lee, Lee 2017, as harmonics of the roll angle."""
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -149,11 +136,11 @@ def check_constraints(
     angles: dict[bool, Expression] = {False: 1, True: 1}
     for joint, (sine, cosine) in pairs.items():
         if rig.limited(joint):
-            inside = _within(rig, joint, sine, cosine, 0.0)
+            inside = _within(rig, joint, sine, cosine)
             angles[joint > 3] = ca.logic_and(angles[joint > 3], inside)
     low, high = rig.limit(1, False), rig.limit(1, True)
-    slide = p.q1 >= low if np.isfinite(low) else 1, p.q1 <= high if np.isfinite(high) else 1
-    return ConstraintCheck(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], *slide)
+    slide = ca.logic_and(p.q1 >= low, p.q1 <= high)
+    return ConstraintCheck(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], slide)
 
 
 def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
@@ -172,24 +159,11 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     """Return roll angles that include all ends of the feasible intervals except the ends at limits of joint 1."""
-    ends = closed_form_ends(rig, target, branch)
-    chart = yaw_chart(rig, branch)
-    for level in yaw_levels(rig, target, branch):
-        for point in level_points(rig, target, level.cosine):
-            above = 1 if level.above else -1
-            ends.append(
-                Candidate(
-                    *polish_to_level(rig, chart, target, value=level.cosine, above=above, point=point), level.code
-                )
-            )
-    return ends
+    return closed_form_ends(rig, target, branch) + yaw_level_ends(rig, target, branch)
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the possible ends of feasible roll intervals that have a closed form.
-
-    They are due to the limits of joints 4 to 6 and to the reach of the pitch link.
-    """
+    """Return the possible ends of arcs due to the limits of joints 4 to 6 and to the reach of the pitch link."""
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
@@ -205,43 +179,36 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
     return ends
 
 
+def yaw_level_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
+    """Return the possible ends of feasible roll intervals due to limits of joints 2 and 3 and the yaw link's reach."""
+    ends, chart = [], yaw_chart(rig, branch)
+    for level in yaw_levels(rig, target, branch):
+        for approximate in level_points(rig, target, level.cosine):
+            point = polish_to_level(rig, chart, target, value=level.cosine, above=level.above, point=approximate)
+            ends.append(Candidate(*point, level.code))
+    return ends
+
+
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2, of joint angle 2, at which an interval of feasible roll angles may end.
-
-    They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
-    """
-    levels = []
-    s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
-
-    def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append a value of cos q2 to `levels`, marked as an interval end only if joint 3 is then within its limits."""
-        if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
-            cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
-            within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
-        levels.append(ArcEndLevel(cosine, code, above, within))
-
-    for sign, angle in ((1, 0.0), (-1, np.pi)):
-        if _allows(rig, 2, angle):
-            add(0.0, sign * (1 - REACH_INSET), 2, sign < 0, 1)
+    """Return the values of cos q2 at which an arc may end, due to limits of joints 2 and 3 and the yaw link's reach."""
+    ends = ((1, 0.0), (-1, np.pi))
+    levels = [ArcEndLevel(sign * (1 - REACH_INSET), 2, sign < 0) for sign, angle in ends if _allows(rig, 2, angle)]
     for upper in (False, True):
         if rig.limited(2):
             angle = inside_limit(rig, 2, upper)
             if branch.yaw * np.sin(angle) > 0:
-                add(np.sin(angle), np.cos(angle), limit_code(2, upper), (branch.yaw < 0) != upper, 1)
+                levels.append(ArcEndLevel(np.cos(angle), limit_code(2, upper), (branch.yaw < 0) != upper))
         if rig.limited(3):
             angle = inside_limit(rig, 3, upper)
-            cosine = s_yaw * np.cos(angle) - c_yaw * np.sin(angle)  # of q2 = yaw - pi/2 - q3
-            sine = -c_yaw * np.cos(angle) - s_yaw * np.sin(angle)
-            within = ca.logic_and(branch.yaw * sine > -COSINE_SLACK, _within(rig, 2, sine, cosine))
-            add(sine, cosine, limit_code(3, upper), (branch.yaw < 0) == upper, within)
+            cosine = ca.sin(target[3]) * np.cos(angle) - ca.cos(target[3]) * np.sin(angle)  # of q2 = yaw - pi/2 - q3
+            levels.append(ArcEndLevel(cosine, limit_code(3, upper), (branch.yaw < 0) == upper))
     return levels
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate roll angles, as (cos, sin), at which the cosine of joint angle 2 has a given value.
+    """Return four approximate rolls, as (cos, sin), at which the cosine of joint angle 2 has a given value.
 
-    They are roots of the squared equation cos q2 = `cosine`. The squared equation is smooth near a stretched pitch
-    link, where cos q2 is not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.
+    They are roots of the squared equation, which is smooth near a stretched pitch link, where cos q2 is not.
     """
     axle, e_c, e_s = corner_circle(rig, target)
     lg, lp = rig.goose_neck, rig.pitch_link
@@ -280,12 +247,10 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
     return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
-def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits; `slack` is a cosine tolerance."""
-    if not rig.limited(joint):
-        return 1
+def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression) -> Expression:
+    """Return whether an angle, given by sine and cosine, is within the limits of a limited joint."""
     middle, half = rig.middle_and_half(joint)
-    return np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half) - slack
+    return np.cos(middle) * cosine + np.sin(middle) * sine >= np.cos(half)
 
 
 def _allows(rig: Rig, joint: int, angle: float) -> bool:
@@ -297,10 +262,9 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function from target and roll angle to cos q2, q1 and cos q4 of the rig's joints q.
+    """Return the casadi Function (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4).
 
-    (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
-    respect to the roll angle. Other functions take the Function as their argument `chart`.
+    A slope is a derivative with respect to the roll. Other functions take the Function as their argument `chart`.
     """
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     configuration = configuration_at(rig, t, c, s, branch=branch)
@@ -309,28 +273,21 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
     return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], configuration.cos4])
 
 
-def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll angle at which the rig's cos q2 (`output` 0) or q1 (2) has a given value, by Newton steps."""
-    return polish(point, chart_residual(chart, target, output, value))
+def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: bool, point: Point) -> Point:
+    """Return the roll at which cos q2 has a value, on the feasible side of it (`above` or below) despite rounding
+    errors.
 
-
-def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2, of joint 2, reaches a limit, on the feasible side despite rounding errors.
-
-    Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
-    is satisfied above the value, -1 if below.
+    Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4.
     """
-    c, s = polish_to_value(chart, target, 0, value=value, point=point)
+    c, s = polish(point, chart_residual(chart, target, 0, value))
     cos4 = ca.fabs(chart(target, c, s)[4])
     margin = SINE_ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
-    return polish((c, s), chart_residual(chart, target, 0, value + above * margin), steps=1)
+    return polish((c, s), chart_residual(chart, target, 0, value + (margin if above else -margin)), steps=1)
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return the function of the roll angle whose root `polish` finds: the difference of cos q2 or q1 and a value.
-
-    `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
-    derivative.
+    """Return the function of (cosine, sine) whose root `polish` finds: cos q2 (`output` 0) or q1 (2) less a value, and
+    its slope.
     """
 
     def function(c: Expression, s: Expression) -> Point:
@@ -345,23 +302,28 @@ def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: 
     return cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
 
 
-def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return a casadi Function that computes the roll angles at which joint 1 is at its lower or upper limit.
+def slide_ends(rig: Rig, branch: Branch) -> Any:
+    """Return the casadi Function from a target to rolls that include all ends of arcs at the limits of joint 1.
 
-    The angles include all ends of feasible intervals at the limit. (target) -> (2, 8), rows cosine and sine of the
-    roll.
+    Output (3, 8 per limit), rows cosine, sine and code of the limit in ACTIVE.
     """
+    target, ends = ca.MX.sym("target", 5), [ca.DM(3, 0)]
     t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-    slope = chart_residual(yaw_chart(rig, branch), t, 2, inside_limit(rig, 1, upper))
-    sharp = [ca.vertcat(*polish((points[0, k], points[1, k]), slope)) for k in range(8)]
-    polished = ca.Function("polished", [t, points], [ca.horzcat(*sharp)])
-    target = ca.MX.sym("target", 5)
-    ends = polished(target, slide_points(rig, upper)(target))
-    return ca.Function("slide_ends", [target], [ends], ["target"], ["points"])
+    chart = yaw_chart(rig, branch)
+    for upper in (False, True):
+        if np.isfinite(rig.limit(1, upper)):
+            residual = chart_residual(chart, t, 2, inside_limit(rig, 1, upper))
+            polished = ca.horzcat(*[ca.vertcat(*polish((points[0, k], points[1, k]), residual)) for k in range(8)])
+            sharpen = ca.Function("polished", [t, points], [polished])
+            approximate = series_roots(4)(_slide_series(rig, upper)(target))
+            ends.append(ca.vertcat(sharpen(target, approximate), ca.DM.ones(1, 8) * limit_code(1, upper)))
+    return ca.Function("slide_ends", [target], [ca.horzcat(*ends)], ["target"], ["points"])
 
 
-def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return a casadi Function that approximates the roll angles at which joint 1 is at a limit. Output (2, 8)."""
+def _slide_series(rig: Rig, upper: bool) -> Any:
+    """Return the casadi Function from a target to the series, as `series_roots` takes it, whose roots put joint 1 at a
+    limit.
+    """
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -375,25 +337,17 @@ def slide_points(rig: Rig, upper: bool) -> Any:
     y = first(axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw, 1)
     height = multiply_series(first(axle[2], 2), first(axle[2], 2))
     stretched = add_series([(rig.pitch_link**2, 0.0)], height, -1)
-    known = add_series(
-        add_series(multiply_series(x, x), multiply_series(y, y)), add_series(stretched, [(rig.yaw_link_1**2, 0.0)], -1)
-    )
+    squares = add_series(multiply_series(x, x), multiply_series(y, y))
+    known = add_series(squares, add_series(stretched, [(rig.yaw_link_1**2, 0.0)], -1))
     along = add_series([(c_yaw * a, c_yaw * b) for a, b in x], [(s_yaw * a, s_yaw * b) for a, b in y])
     f = add_series(multiply_series(known, known), multiply_series(stretched, multiply_series(along, along)), -4)
-    outputs = ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])
-    coefficients = ca.Function("slide", [t], outputs)
-    target = ca.MX.sym("target", 5)
-    return ca.Function("slide_points", [target], [series_roots(4)(coefficients(target))], ["target"], ["points"])
+    return ca.Function(
+        "slide", [t], ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])
+    )
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the factor of the squared change of roll in the cost index I2: the rate weight divided by 2 pi.
-
-    The factor is w4 / (2 pi), equation (37) of the paper.
-
-    Raises:
-        ModelError: The weight w4, `rate_weight`, is negative or not finite.
-    """
+    """Return the factor w4 / (2 pi) of the squared change of roll in I2; raise ModelError for an invalid w4."""
     return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 
@@ -415,10 +369,10 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function from target and previous roll to five rolls, among them all minima of the cost index I2.
+    """Return the casadi Function (target, previous roll) -> five rolls, (5, 1), rad, with all minima of I2 among them.
 
-    I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
-    window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
+    If I2 is convex there is one. Otherwise the rolls are split where I1'' = -2 gain, and each interval has its own
+    minimum.
     """
     target, previous = ca.SX.sym("target", 5), ca.SX.sym("previous")
     f = index_harmonics(rig, tunnel, target)

@@ -1,8 +1,7 @@
 """Inverse kinematics of the rig for tables of targets, intervals of feasible roll angles, and export to C code.
 
-`solve_table` converts a table of targets to a table of joints; rows without a solution have the reason as their status.
-`rig_functions` and `export` serve controllers without Python. The generated C needs only the mathematics library. It is
-straight-line code with a few branches, so its computing time is bounded.
+The generated C needs only the mathematics library. It is straight-line code with a few branches, so its computing time
+is bounded.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array, ArrayInput, require, warn_of_degrees
-from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import Avoidance, collision_free_inverse
+from models.cts.best_roll import Avoidance, collision_free_inverse, optimal_inverse
 from models.cts.rig import (
     HOME,
     Branch,
@@ -31,7 +29,7 @@ from models.cts.rig import (
     goose_neck_corner,
     inverse,
 )
-from models.cts.roll import ACTIVE, STATUS, arc_ends, check_constraints, limit_code, slide_ends
+from models.cts.roll import ACTIVE, STATUS, arc_ends, check_constraints, slide_ends
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -123,9 +121,8 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return the result of the best branch for each target. Shape (samples, 10).
-
-    Columns: joint positions (6), cost, branch number, codes of active constraint and status.
+    """Return (joints (6), cost, branch number, active code, status code) of the best branch for each target. Shape (M,
+    10).
     """
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
@@ -201,17 +198,14 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     (target) -> points, with rows cosine, sine and code of the constraint in roll.ACTIVE; (target, roll) -> feasible.
     """
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
-    angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
-    x = ca.MX.sym("target", 5)
-    parts = [ca.Function("angle_ends", [target], [angle])(x)]
-    for upper in (False, True):
-        if np.isfinite(rig.limit(1, upper)):
-            parts.append(ca.vertcat(slide_ends(rig, branch, upper)(x), ca.DM.ones(1, 8) * limit_code(1, upper)))
-    ends = ca.Function("arc_ends", [x], [ca.horzcat(*parts)], ["target"], ["points"])
     c, s = ca.cos(roll), ca.sin(roll)
     meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch=branch), c=c, s=s)
-    inside = ca.logic_and(meets.all_but_slide(), meets.slide())
-    return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
+    inside = ca.logic_and(meets.all_but_slide(), meets.slide)
+    feasible = ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
+    rolls = ca.horzcat(*[ca.vertcat(*end) for end in arc_ends(rig, target, branch)])
+    x = ca.MX.sym("target", 5)
+    points = ca.horzcat(ca.Function("angle_ends", [target], [rolls])(x), slide_ends(rig, branch)(x))
+    return ca.Function("arc_ends", [x], [points], ["target"], ["points"]), feasible
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
@@ -243,11 +237,9 @@ def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: 
 
 
 def export(functions: dict[str, Any] | Iterable[Any], path: Path) -> Path:
-    """Write casadi Functions as a C file and its header; the code needs only the C mathematics library.
+    """Write casadi Functions as a C file at `path`, which must end in .c, and its header; create the folder.
 
-    Args:
-        functions: casadi Functions, or a dictionary of them.
-        path: Path of the C file; its folder is created.
+    The code needs only the C mathematics library.
 
     Raises:
         ModelError: There is no function, or the path does not end in .c.

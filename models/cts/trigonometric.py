@@ -1,8 +1,7 @@
 """Roots and minima of trigonometric polynomials of one angle, in a bounded number of operations.
 
-Points of the unit circle are pairs (cosine, sine), so no trigonometric function of the angle is evaluated. Polynomials
-of two harmonics are solved in closed form without branches, those of any degree by a simultaneous iteration on all
-roots.
+Points of the unit circle are pairs (cosine, sine). Polynomials of two harmonics are solved in closed form without
+branches, those of any degree by a simultaneous iteration on all roots.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ class RootSettings:
         cubic_steps, polish_steps, least_steps: Newton or Halley steps to the root of the pencil, to a root, and to the
             minimum, after which only rounding errors are left.
         max_polish_step: Largest step of the polish, rad.
-        root_tolerance: Largest distance of an approximate root from its polished root, rad.
         stages: Numbers of simultaneous steps on all roots in `series_roots`; after each stage but the last, the
             iteration ends if all roots move by less than `step_tolerance`.
         step_tolerance: Step of a root, relative to the root, at which the iteration ends.
@@ -49,7 +47,6 @@ class RootSettings:
     polish_steps: int = 3
     least_steps: int = 4
     max_polish_step: float = 0.05
-    root_tolerance: float = 0.01
     stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)
     step_tolerance: float = 1e-5
 
@@ -143,10 +140,10 @@ def roots(f: Harmonics, steps: int = ROOTS.polish_steps) -> list[Point]:
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return the rotation that removes the mixed term x y of a polynomial on the unit circle, and its new coefficients.
+    """Return a rotation (cosine, sine) and p, q, r > 0 with f = a0 + p x + q y + r (x^2 - y^2) on the circle in rotated
+    axes.
 
-    The rotation is (cosine, sine). With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the
-    rotated axes. `shift` is added to a2, so that the second harmonic has a direction.
+    `shift` is added to a2, so that the second harmonic has a direction.
     """
     a2 = f.a2 + shift
     r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
@@ -205,8 +202,7 @@ def polish(
 ) -> Point:
     """Refine an approximate root, a point of the unit circle, by Newton steps of limited size (rad).
 
-    `function` returns value and derivative with respect to the angle. If the square of the derivative is below `floor`
-    the steps vanish.
+    The steps vanish where the square of the derivative is below `floor`.
     """
     c, s = point
     for _ in range(steps):
@@ -225,10 +221,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the parameter in [-1, 1] at which the pencil of conics that `roots` uses contains a pair of real lines.
-
-    The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
-    """
+    """Return the root t = l / r in [-1, 1] of 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0, see `roots`."""
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1
     b0 = a0 / r + (q * q - p * p) / (4 * r * r)
@@ -278,12 +271,11 @@ def add_series(f: Series, g: Series, factor: float = 1) -> Series:
 
 
 def series_roots(degree: int) -> Any:
-    """Return the casadi Function that finds the simple roots of a trigonometric series from its coefficients.
+    """Return the casadi Function that approximates the simple roots of a trigonometric series, to a few correct digits.
 
-    The roots are points of the unit circle. Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and
-    sine. The roots z = exp(i angle) of the polynomial z^degree f are computed simultaneously (Aberth 1973) in at most
-    sum(ROOTS.stages) steps. Roots off the circle are projected to it and meaningless. The result has a few correct
-    digits; polish it with the function at hand.
+    Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. All roots of the polynomial
+    z^degree f with z = exp(i angle) are iterated simultaneously (Aberth 1973). Roots off the circle are projected to it
+    and meaningless.
     """
     n = 2 * degree
     coefficients = ca.SX.sym("coefficients", 2, degree + 1)
@@ -346,10 +338,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function that performs `count` iterations of the method by which `series_roots` finds all roots.
-
-    (roots, coefficients) -> (roots, excess of the last step over the tolerance).
-    """
+    """Return the Function (roots, coefficients) -> (roots, excess of the last step) of `count` iterations."""
     z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
     iterates, longest = z, None
     for _ in range(count):

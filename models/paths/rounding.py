@@ -113,9 +113,10 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners of a path, and the distance from each vertex to both ends of its blend. Shape (n - 1,), m.
+    """Return the corners, with the best shape factors if `free`, and the distance from each vertex to its blend's ends,
+    m.
 
-    The corners have the best shape factors if `free`. Other arguments as for `smooth`.
+    Other arguments as for `smooth`.
     """
     require.choice("path: overlap", overlap, get_args(Overlap))
     if (remaining is None) == (deviation is None):
@@ -238,7 +239,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     """Return the distance of each vertex from its blend, and the largest distance of the blend from its two segments.
 
     Together they bound the deviation between smooth path and task in both directions. They are sampled uniformly and
-    again about the maximum. The first is never below the true value, the second by at most 0.1 %. Shape (V,), m.
+    again about the maximum; the second is below the true value by at most 0.1 %. Shape (V,), m.
     """
     path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
     u = np.linspace(0, 1, SETTINGS.samples)
@@ -293,10 +294,7 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points, shape (V, S, 3), from V parts of path segments. Shape (V, S), m.
-
-    Each part, for one row of points, extends from the distance `first` to the distance `last` along its segment.
-    """
+    """Return the distances (V, S), m, of points (V, S, 3) from V parts of segments, from `first` to `last`, m."""
     spatial = (path.torsion[index] != 0) | path.is_spline[index]
     if spatial.any():
         result = np.empty(points.shape[:2])
@@ -323,10 +321,7 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
 
 def _distance_to_curve(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points from parts of helices or splines, by Newton's method from the closest sample.
-
-    Arguments and shapes are those of `_distance_to_segment`.
-    """
+    """Return the distances of points from parts of helices or splines, by Newton's method from the closest sample."""
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_curve(path, index[p], points[p], first[p], last[p]) for p in parts])

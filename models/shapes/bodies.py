@@ -17,7 +17,7 @@ from warnings import warn
 
 import numpy as np
 
-from models.checks import Array, require
+from models.checks import Array, require, set_fields
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Joint, Link
 from models.robot.robot import Robot
@@ -80,7 +80,7 @@ class Body:
         if not np.isfinite(reach):
             message = f"{owner}: shape {self.shape!r} is unbounded; give a bounded one"
             raise ModelError(message, name="shape", value=self.shape)
-        object.__setattr__(self, "overhang", require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
+        set_fields(self, overhang=require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
 
 
 def collision_bodies(
@@ -162,16 +162,11 @@ def _primitive_body(link: Link, shape: CollisionShape) -> Body:
 
 
 def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
-    """Return volume, size and protrusion of the smallest capsule that encloses a cylinder.
+    """Return volume (m^3), size (radius, length without caps, m) and protrusion (m) of the smallest capsule around a
+    cylinder.
 
     With the capsule radius R, the rims of the cylinder of radius r lie on the caps, which begin sqrt(R^2 - r^2) before
     the cylinder's ends.
-
-    Args:
-        radius, length: Size of the cylinder, m.
-
-    Returns:
-        Volume, m^3; radius R and length without the caps, m; distance by which the poles protrude, m.
     """
     largest = float(np.hypot(radius, length / 2))
     # dense near the cylinder's radius, where the cap length changes most
@@ -207,7 +202,7 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
 
 
 class JointStep(NamedTuple):
-    """A moving joint between two rigid parts of a robot (`RigidParts`): the part above and the part below the joint.
+    """A moving joint between two rigid parts of a robot (`RigidParts`).
 
     Attributes:
         joint: Its child link names the part below.

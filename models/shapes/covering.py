@@ -1,9 +1,7 @@
 """Covers of a triangle mesh by a few capsules or one box, whose distances can be computed exactly and fast.
 
-First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
-covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
-number of parts weighs volume against cost. A box replaces the capsules where it is clearly smaller, because distances
-of boxes cost many times more.
+One capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the covered
+volume most, each side gets its own capsule, and so on. A box replaces the capsules where it is clearly smaller.
 
 Every triangle, split at the planes, lies in the capsule of its part. So do all points that a closed surface encloses:
 from a point between two planes of a split, a line parallel to the planes meets the surface between them.
@@ -186,7 +184,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
     """Return volume, radius, ends, axis and a point of the axis of the capsule around points for given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
-    radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
+    radius.
     """
     a, b, x, y, fat = parameters.tolist()
     length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
@@ -205,9 +203,8 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
-    """Return a small capsule around points whose axis is the last axis of one of k given bases, shape (k, 3, 3).
-
-    It is given by its parameters in that basis, as `_evaluate_capsule` takes them, the basis, and the volume.
+    """Return parameters (as in `_evaluate_capsule`), basis and volume of a small capsule around points; bases (k, 3,
+    3).
     """
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
@@ -250,10 +247,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the two parts of a mesh, split by a plane, whose covering capsules have the least total volume.
-
-    If no plane splits the part, the part itself is returned.
-    """
+    """Return the two parts of a mesh, split by a plane, of least covered volume; the part itself if none splits it."""
     points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
@@ -286,9 +280,8 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return sample points spread evenly in a box 1.5 times as large as given points' extent, and the box's volume.
-
-    They serve to estimate covered volumes: the box contains nearly all of the covers. Shape (k, 3).
+    """Return points, (k, 3), spread evenly in a box that contains nearly all of the covers of given points, and its
+    volume.
     """
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
@@ -336,9 +329,8 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points.
-
-    One of its faces lies along a face of the hull of the extreme points, one of its edges along an edge.
+    """Return a box of nearly least volume around points, with a face along a face of the hull and an edge along an
+    edge.
     """
     frames = [_principal_axes(points)]
     try:

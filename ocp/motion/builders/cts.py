@@ -21,8 +21,7 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array, real
-from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
+from models.cts.best_roll import CollisionScene, Radii, checked_clearance, clearances, optimal_inverse, proximity_cost
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets

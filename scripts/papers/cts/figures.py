@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from models import Rig
 from models.checks import Array
-from models.cts.clearance import rig_capsules
+from models.cts.best_roll import rig_capsules
 from models.cts.rig import INCH
 from ocp.app.view.appearance import Part, part_of, rod
 from ocp.app.view.rendering import Camera, Layer, render, tube

@@ -11,7 +11,7 @@ import numpy as np
 
 from models import Box, Rig, Tunnel, optimal_inverse
 from models.checks import Array
-from models.cts.clearance import CollisionScene, clearances
+from models.cts.best_roll import CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
 from ocp import Collocation, Problem, RollObstacles, RollSettings, roll_problem, solve

@@ -12,7 +12,7 @@ import numpy as np
 
 from models import Box, Link, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.checks import Array
-from models.cts.clearance import CollisionScene, clearances
+from models.cts.best_roll import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, forward, goose_neck_corner, inverse
 from models.cts.roll import index_harmonics
 from models.cts.table import Table

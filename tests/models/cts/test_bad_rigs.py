@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import Avoidance, CollisionScene, Radii, clearances, collision_free_inverse
+from models.cts.best_roll import Avoidance, CollisionScene, Radii, clearances, collision_free_inverse
 from models.cts.rig import INCH, Branch
 from models.cts.table import reachable_rolls
 from tests.bad_values import (

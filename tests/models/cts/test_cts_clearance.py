@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import Box, ModelError, optimal_inverse, reference_rig, reference_tunnel, solve_table
-from models.cts.clearance import Avoidance, CollisionScene, clearances, collision_free_inverse
+from models.cts.best_roll import Avoidance, CollisionScene, clearances, collision_free_inverse
 from models.cts.rig import HOME, INCH, inverse
 from models.cts.roll import ACTIVE, STATUS
 from models.shapes.distance import soft_minimum

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Link, ModelError, reference_rig
-from models.cts.clearance import CollisionScene, clearances, rig_capsules
+from models.cts.best_roll import CollisionScene, clearances, rig_capsules
 from models.cts.rig import dh_frames
 from models.shapes.distance import soft_minimum
 from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
-from models.cts.clearance import CollisionScene, clearances
+from models.cts.best_roll import CollisionScene, clearances
 from models.cts.rig import HOME, INCH, inverse
 from ocp import Collocation, ProblemError, RollObstacles, RollSettings, Solution, roll_problem, solve, spline_targets
 from ocp.motion.builders.cts import least_cost_roll
