@@ -105,12 +105,9 @@ class Checks:
     The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
     "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
     last word of the label, `value`, and `limit`, what is allowed.
-
-    Attributes:
-        error: Class of the exceptions.
     """
 
-    error: type[DetailedError]
+    error: type[DetailedError]  # class of the exceptions
 
     def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
         """Return the exception about an argument that violates a requirement, with label, requirement and value."""

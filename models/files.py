@@ -38,62 +38,37 @@ import numpy as np
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Largest accepted sizes of input, several times those of the largest known files but small enough for the memory.
+    """Largest accepted sizes of input, several times those of the largest known files."""
 
-    Attributes:
-        count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
-        array_entries: Entries of one array.
-        name_characters: Characters of a link or joint name.
-        description_bytes: Bytes of a URDF, SRDF or MJCF file. The largest public ones have 1 MB.
-        xml_elements: Elements plus attributes of an XML document. Each takes about 200 bytes of memory.
-        mesh_bytes, mesh_text_bytes: Bytes of a binary and a text mesh file. Parsing text takes several times its size.
-        mesh_triangles: Triangles of a scene after all instances are placed.
-        scene_nodes: Nodes of a Collada scene, counted once per instance; parts of bodies in an MJCF file.
-        text_bytes, text_lines, line_characters: Size of waypoint, trajectory and G-code files. A path takes 1 or 2 kB a
-            line.
-        number_characters: Characters of a G-code number.
-        task_bytes: Bytes of a task or obstacle file.
-        nesting: Depth of nested containers, nodes and dotted names.
-        tree_values: Values plus keys of a JSON or YAML file.
-        log_bytes: Bytes of an MCAP file, also after decompression.
-        log_record_bytes: Bytes of a decompressed MCAP record or chunk.
-        log_message_bytes: Bytes of all joint messages of a log, which take five times as much memory.
-    """
-
-    count: int = 1_000_000
-    array_entries: int = 2**22
-    name_characters: int = 500
-    description_bytes: int = 2**23
-    xml_elements: int = 2**20
-    mesh_bytes: int = 2**28
-    mesh_text_bytes: int = 2**26
-    mesh_triangles: int = 2**22
-    scene_nodes: int = 2**12
-    text_bytes: int = 2**25
-    text_lines: int = 500_000
-    line_characters: int = 10_000
-    number_characters: int = 32
-    task_bytes: int = 2**20
-    nesting: int = 64
-    tree_values: int = 2**21
-    log_bytes: int = 2**30
-    log_record_bytes: int = 2**26
-    log_message_bytes: int = 2**26
+    count: int = 1_000_000  # any number that a user chooses, such as a number of nodes
+    array_entries: int = 2**22  # entries of one array
+    name_characters: int = 500  # characters of a link or joint name
+    description_bytes: int = 2**23  # bytes of a URDF, SRDF or MJCF file; the largest public ones have 1 MB
+    xml_elements: int = 2**20  # elements plus attributes of an XML document, each about 200 bytes of memory
+    mesh_bytes: int = 2**28  # bytes of a binary mesh file
+    mesh_text_bytes: int = 2**26  # bytes of a text mesh file, whose parsing takes several times its size
+    mesh_triangles: int = 2**22  # triangles of a scene after all instances are placed
+    scene_nodes: int = 2**12  # nodes of a Collada scene, counted once per instance; parts of bodies in an MJCF file
+    text_bytes: int = 2**25  # bytes of waypoint, trajectory and G-code files; a path takes 1 or 2 kB a line
+    text_lines: int = 500_000  # lines of such a file
+    line_characters: int = 10_000  # characters of a line of such a file
+    number_characters: int = 32  # characters of a G-code number
+    task_bytes: int = 2**20  # bytes of a task or obstacle file
+    nesting: int = 64  # depth of nested containers, nodes and dotted names
+    tree_values: int = 2**21  # values plus keys of a JSON or YAML file
+    log_bytes: int = 2**30  # bytes of an MCAP file, also after decompression
+    log_record_bytes: int = 2**26  # bytes of a decompressed MCAP record or chunk
+    log_message_bytes: int = 2**26  # bytes of all joint messages of a log, which take five times as much memory
 
 
 INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: it is no regular file, is too large, or other users own it or may change it.
+    """Error about a file that is not read: no regular file, too large, or one that other users own or may change."""
 
-    Attributes:
-        value: Size of a file that is too large, bytes; else None.
-        limit: Largest size that is read, bytes; else None.
-    """
-
-    value: int | None = None
-    limit: int | None = None
+    value: int | None = None  # size of a file that is too large, bytes; else None
+    limit: int | None = None  # largest size that is read, bytes; else None
 
 
 def open_regular(path: str | os.PathLike[str], most: int, own: bool = False, links: bool = True) -> BufferedReader:

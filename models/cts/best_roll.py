@@ -249,27 +249,16 @@ def _distance_to_walls(capsule: LinkCapsule, walls: Box) -> Expression:
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for the roll angle of least cost at which the rig collides with nothing.
+    """Settings of the search for the roll angle of least cost at which the rig collides with nothing."""
 
-    Attributes:
-        samples: Number of rolls in the grid.
-        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
-        minima: Number of local minima on the grid that are refined.
-        steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes: 0.62^44 = 7e-10
-            of the grid's.
-        penalty: Penalty on missing clearance in the merit function, 1/m.
-        inset: Distance beyond the least clearance that the search aims for, m.
-        active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
-    """
-
-    samples: int = 72
-    softness: float = 2e-3
-    minima: int = 4
-    steps: int = 44
-    shrink: float = 0.62
-    penalty: float = 1e3
-    inset: float = 1e-10
-    active_tolerance: float = 1e-6
+    samples: int = 72  # number of rolls in the grid
+    softness: float = 2e-3  # width of the smooth minimum of all distances, m; see `soft_minimum`
+    minima: int = 4  # number of local minima on the grid that are refined
+    steps: int = 44  # steps of the pattern search
+    shrink: float = 0.62  # ratio of successive step sizes; 0.62^44 is 7e-10
+    penalty: float = 1e3  # penalty on missing clearance in the merit function, 1/m
+    inset: float = 1e-10  # distance beyond the least clearance that the search aims for, m
+    active_tolerance: float = 1e-6  # distance from the least clearance below which the constraint counts as active, m
 
 
 SEARCH = ClearanceSearch()

@@ -115,15 +115,10 @@ class Tunnel:
 
 
 class Branch(NamedTuple):
-    """One of the four branches of the rig's inverse kinematics, given by two signs.
+    """One of the four branches of the rig's inverse kinematics, given by two signs."""
 
-    Attributes:
-        yaw: Sign of sin q2: +1 for q2 = +acos(.) in equation (25), -1 for -acos(.), the side of the home position.
-        pitch: Sign of cos q4: +1 for the principal asin in equation (23), -1 for pi minus it.
-    """
-
-    yaw: int = -1
-    pitch: int = 1
+    yaw: int = -1  # sign of sin q2: +1 for q2 = +acos(.) in equation (25), -1 for -acos(.), the home position
+    pitch: int = 1  # sign of cos q4: +1 for the principal asin in equation (23), -1 for pi minus it
 
 
 BRANCHES = (Branch(-1, 1), Branch(-1, -1), Branch(1, 1), Branch(1, -1))
@@ -136,21 +131,14 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll angle and a branch.
+    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll angle and a branch."""
 
-    Attributes:
-        corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.
-        sin4, cos4, sin2, cos2: Sines and cosines of joints 4 and 2. Out of reach sin4 or cos2 leaves [-1, 1] and its
-            partner is nearly 0.
-        q1: Position of the prismatic joint, m.
-    """
-
-    corner: Expression
-    sin4: Expression
-    cos4: Expression
-    sin2: Expression
-    cos2: Expression
-    q1: Expression
+    corner: Expression  # P_G, the goose-neck's corner, in world. Shape (3, 1), m.
+    sin4: Expression  # of joint 4; out of reach it leaves [-1, 1] and its partner is nearly 0
+    cos4: Expression  # of joint 4
+    sin2: Expression  # of joint 2
+    cos2: Expression  # of joint 2; out of reach it leaves [-1, 1] and its partner is nearly 0
+    q1: Expression  # position of the prismatic joint, m
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:

@@ -90,17 +90,11 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end.
+    """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end."""
 
-    Attributes:
-        cosine: The value.
-        code: Code of the constraint, in ACTIVE.
-        above: Whether the constraint is satisfied above the value, not below.
-    """
-
-    cosine: Expression
-    code: int
-    above: bool
+    cosine: Expression  # the value
+    code: int  # code of the constraint, in ACTIVE
+    above: bool  # whether the constraint is satisfied above the value, not below
 
 
 def limit_code(joint: int, upper: bool) -> int:

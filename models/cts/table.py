@@ -143,16 +143,11 @@ def _best_branch(results: list[Any]) -> Array:
 
 @dataclass(frozen=True)
 class RollInterval:
-    """An interval of roll angles at which the rig reaches a target within all joint limits.
+    """An interval of roll angles at which the rig reaches a target within all joint limits."""
 
-    Attributes:
-        start, end: rad, end >= start; a full turn is -pi .. pi.
-        constraints: Active constraints (of roll.ACTIVE) at start and end; ("free", "free") for a full turn.
-    """
-
-    start: float
-    end: float
-    constraints: tuple[str, str]
+    start: float  # rad; a full turn is -pi .. pi
+    end: float  # rad, not below the start
+    constraints: tuple[str, str]  # active ones (of roll.ACTIVE) at start and end; ("free", "free") for a full turn
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:

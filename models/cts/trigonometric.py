@@ -27,28 +27,16 @@ SMALLEST_DIVISOR = 1e-300
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding for trigonometric polynomials; they bound the number of operations.
+    """Settings of the root finding for trigonometric polynomials; they bound the number of operations."""
 
-    Attributes:
-        min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the
-            polish removes the difference.
-        min_square_harmonic: Smallest second harmonic whose square does not underflow.
-        cubic_steps, polish_steps, least_steps: Newton or Halley steps to the root of the pencil, to a root, and to the
-            minimum, after which only rounding errors are left.
-        max_polish_step: Largest step of the polish, rad.
-        stages: Numbers of simultaneous steps on all roots in `series_roots`; after each stage but the last, the
-            iteration ends if all roots move by less than `step_tolerance`.
-        step_tolerance: Step of a root, relative to the root, at which the iteration ends.
-    """
-
-    min_second_harmonic: float = 1e-6
-    min_square_harmonic: float = 1e-100
-    cubic_steps: int = 2
-    polish_steps: int = 3
-    least_steps: int = 4
-    max_polish_step: float = 0.05
-    stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)
-    step_tolerance: float = 1e-5
+    min_second_harmonic: float = 1e-6  # smallest relative one in the pencil of conics; the polish removes the error
+    min_square_harmonic: float = 1e-100  # smallest second harmonic whose square does not underflow
+    cubic_steps: int = 2  # Newton steps to the root of the pencil
+    polish_steps: int = 3  # Newton steps to a root, after which only rounding errors are left
+    least_steps: int = 4  # Halley and Newton steps to the minimum, likewise
+    max_polish_step: float = 0.05  # largest step of the polish, rad
+    stages: tuple[int, ...] = (6, 1, 1, 1, 1, 2, 4, 8, 16)  # steps on all roots; ends at small steps after a stage
+    step_tolerance: float = 1e-5  # step of a root, relative to the root, at which the iteration ends
 
 
 ROOTS = RootSettings()

@@ -35,17 +35,11 @@ MIN_SOFTNESS_M = 1e-6
 
 
 class PlacedShape(NamedTuple):
-    """A shape in a collision scene, with its name and the frame that carries it.
+    """A shape in a collision scene, with its name and the frame that carries it."""
 
-    Attributes:
-        name: Name of its link, with a number if the link has several shapes, or of an obstacle.
-        shape: Shape in the frame that carries it.
-        frame: Index of that frame among those of `CollisionScene.placements`; -1 for the world.
-    """
-
-    name: str
-    shape: Shape
-    frame: int
+    name: str  # name of its link, with a number if the link has several shapes, or of an obstacle
+    shape: Shape  # shape in the frame that carries it
+    frame: int  # index of that frame among those of `CollisionScene.placements`; -1 for the world
 
 
 class Levers(NamedTuple):
@@ -53,16 +47,12 @@ class Levers(NamedTuple):
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
-
-    Attributes:
-        base, base_turns: Of the base configuration. Shape (n, base_size).
-        joints, joint_turns: Of the joints. Shape (n, joint_size).
     """
 
-    base: Array
-    base_turns: Array
-    joints: Array
-    joint_turns: Array
+    base: Array  # of the base configuration. Shape (n, base_size).
+    base_turns: Array  # of the base configuration. Shape (n, base_size).
+    joints: Array  # of the joints. Shape (n, joint_size).
+    joint_turns: Array  # of the joints. Shape (n, joint_size).
 
 
 @dataclass(frozen=True, eq=False)

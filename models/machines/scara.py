@@ -207,23 +207,14 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them.
+    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them."""
 
-    Attributes:
-        scara: The arm.
-        path: Path of the tool.
-        elbow: Side of the elbow along the whole path.
-        rates: Function of the pose and its derivatives, see `Scara.inverse_rates`.
-        table: Arc lengths (m) and continuous joint positions, dense enough to tell full turns. Shape (K,) and (K, 4).
-        turns: Whole turns added to the joints so that they keep their limits. Shape (4,), rad.
-    """
-
-    scara: Scara
-    path: SmoothPath
-    elbow: Elbow
-    rates: Any
-    table: tuple[Array, Array]
-    turns: Array
+    scara: Scara  # the arm
+    path: SmoothPath  # path of the tool
+    elbow: Elbow  # side of the elbow along the whole path
+    rates: Any  # function of the pose and its derivatives, see `Scara.inverse_rates`
+    table: tuple[Array, Array]  # arc lengths (K,), m, and continuous joints (K, 4), dense enough to tell turns
+    turns: Array  # whole turns added to the joints so that they keep their limits. Shape (4,), rad.
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -52,16 +52,11 @@ class ZmpRows(NamedTuple):
     """Coefficients of the linear condition on joint accelerations that keeps the zero moment point at a given position.
 
     J_m q'' + q'^T H_m q' = C, equation (18) of the paper. Row 0 fixes x, row 1 y, as moments about the position, N m.
-
-    Attributes:
-        jacobian: J_m. Shape (2, n).
-        hessians: The two planes of H_m, symmetric. Shape (n, n) each.
-        right: C, with gravity and the wrenches. Shape (2, 1).
     """
 
-    jacobian: Expression
-    hessians: tuple[Expression, Expression]
-    right: Expression
+    jacobian: Expression  # J_m. Shape (2, n).
+    hessians: tuple[Expression, Expression]  # the two planes of H_m, symmetric. Shape (n, n) each.
+    right: Expression  # C, with gravity and the wrenches. Shape (2, 1).
 
     def needed(self, qd: Expression) -> Expression:
         """Return J_m q'' = C - q'^T H_m q', the moments that joint accelerations must produce. Shape (2, 1), N m."""
@@ -247,39 +242,23 @@ Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
 
 @dataclass(frozen=True)
 class StandingMotion:
-    """A motion of a standing machine at M sampled times, with the joint torques and ground reaction it requires.
+    """A motion of a standing machine at M sampled times, with the joint torques and ground reaction it requires."""
 
-    Attributes:
-        t: Times. Shape (M,), s.
-        joints, joint_velocities, joint_accelerations: Shape (M, n).
-        joint_torques: By inverse dynamics. Shape (M, n), N m or N.
-        tip_in_world: Shape (M, 3), m.
-        external_force: Sum of the external forces, wherever they act, world axes. Shape (M, 3), N.
-        center_of_mass: Shape (M, 3), m.
-        ground_force: Force of the ground on the foot. Shape (M, 3), N.
-        zero_moment_point: (x, y). Shape (M, 2), m.
-        index: Stability index in x and y, equations (5) and (6). Shape (M, 2).
-        foot_margin: Signed distance of the zero moment point from the edge of the support. Shape (M,), m.
-        joint_excess: Largest violation of a joint limit, negative inside. Shape (M,), rad or m.
-        joint_limit_index: p1, equation (23). Shape (M,).
-        manipulability: p2, equation (27), of the task's rows. Shape (M,).
-    """
-
-    t: Array
-    joints: Array
-    joint_velocities: Array
-    joint_accelerations: Array
-    joint_torques: Array
-    tip_in_world: Array
-    external_force: Array
-    center_of_mass: Array
-    ground_force: Array
-    zero_moment_point: Array
-    index: Array
-    foot_margin: Array
-    joint_excess: Array
-    joint_limit_index: Array
-    manipulability: Array
+    t: Array  # times. Shape (M,), s.
+    joints: Array  # shape (M, n)
+    joint_velocities: Array  # shape (M, n)
+    joint_accelerations: Array  # shape (M, n)
+    joint_torques: Array  # by inverse dynamics. Shape (M, n), N m or N.
+    tip_in_world: Array  # shape (M, 3), m
+    external_force: Array  # sum of the external forces, wherever they act, world axes. Shape (M, 3), N.
+    center_of_mass: Array  # shape (M, 3), m
+    ground_force: Array  # force of the ground on the foot. Shape (M, 3), N.
+    zero_moment_point: Array  # (x, y). Shape (M, 2), m.
+    index: Array  # stability index in x and y, equations (5) and (6). Shape (M, 2).
+    foot_margin: Array  # signed distance of the zero moment point from the edge of the support. Shape (M,), m.
+    joint_excess: Array  # largest violation of a joint limit, negative inside. Shape (M,), rad or m.
+    joint_limit_index: Array  # p1, equation (23). Shape (M,).
+    manipulability: Array  # p2, equation (27), of the task's rows. Shape (M,).
 
     @property
     def friction(self) -> Array:

@@ -154,31 +154,18 @@ def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class ShapeSearch:
-    """Settings of the search for the shape factor that gives a blend the least peak curvature.
+    """Settings of the search for the shape factor that gives a blend the least peak curvature."""
 
-    Attributes:
-        narrowest, widest: Range searched for the factor times remaining distance over the chord; between two lines the
-            best lies from 0.885 to 2.44.
-        below_cusp: Upper limit of the factor, relative to that of the cusp.
-        coarse: Number of factors of the coarse grid.
-        steps: Golden-section steps between the neighbours of the best.
-        samples: Samples of a blend for its peak curvature.
-        table_angles, table_samples: Corners of the table, and samples of each.
-        least_angle: Smallest angle of the table, rad; below, the best factor over the sine of half the angle is
-            constant.
-        block: Corners processed at once, which bounds the memory.
-    """
-
-    narrowest: float = 0.5
-    widest: float = 3.0
-    below_cusp: float = 0.95
-    coarse: int = 9
-    steps: int = 16
-    samples: int = 49
-    table_angles: int = 65
-    table_samples: int = 201
-    least_angle: float = 1e-3
-    block: int = 500
+    narrowest: float = 0.5  # range of the factor times remaining distance over the chord, between lines 0.885 to 2.44
+    widest: float = 3.0  # upper end of this range
+    below_cusp: float = 0.95  # upper limit of the factor, relative to that of the cusp
+    coarse: int = 9  # number of factors of the coarse grid
+    steps: int = 16  # golden-section steps between the neighbours of the best
+    samples: int = 49  # samples of a blend for its peak curvature
+    table_angles: int = 65  # corners of the table
+    table_samples: int = 201  # samples of each of these corners
+    least_angle: float = 1e-3  # smallest angle of the table, rad; below, factor over sine of half the angle is constant
+    block: int = 500  # corners processed at once, which bounds the memory
 
 
 SEARCH = ShapeSearch()
@@ -270,17 +257,12 @@ class Cells(NamedTuple):
     """Intervals of the curve parameter u (cells) into which polynomial curves are split to compute arc lengths.
 
     They are in the order of the curves, then of u.
-
-    Attributes:
-        curve: Index of the curve. Shape (C,).
-        start, width: Start and width of the interval of u. Shape (C,).
-        length: Arc length of the interval. Shape (C,), m.
     """
 
-    curve: NDArray[np.intp]
-    start: Array
-    width: Array
-    length: Array
+    curve: NDArray[np.intp]  # index of the curve. Shape (C,).
+    start: Array  # start of the interval of u. Shape (C,).
+    width: Array  # width of the interval of u. Shape (C,).
+    length: Array  # arc length of the interval. Shape (C,), m.
 
 
 def speed(coefficients: Array, u: Array) -> Array:

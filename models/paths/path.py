@@ -289,39 +289,23 @@ def _angles(before: Array, after: Array) -> Array:
 
 
 class FittedPath(NamedTuple):
-    """Path in which splines and lines replace runs of short segments; see `fit_splines`.
+    """Path in which splines and lines replace runs of short segments; see `fit_splines`."""
 
-    Attributes:
-        path: The path of n segments.
-        first: Index of the first segment of the given path that each segment replaces. Shape (n,).
-        deviation: Deviation that remains for rounding each vertex. Shape (n - 1,), m.
-    """
-
-    path: Path
-    first: NDArray[np.intp]
-    deviation: Array
+    path: Path  # the path of n segments
+    first: NDArray[np.intp]  # index of the first segment of the given path that each segment replaces. Shape (n,).
+    deviation: Array  # deviation that remains for rounding each vertex. Shape (n - 1,), m.
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of the search for runs of short segments that a spline or a line can replace.
+    """Settings of the search for runs of short segments that a spline or a line can replace."""
 
-    Attributes:
-        simplified: Deviation of the simplified polyline that shows the corners, relative to the tolerance.
-        spline: Largest deviation of a spline, relative to the tolerance; the rest is for rounding the vertices.
-        sagitta: Distance of an arc from the chords that stand for it, relative to the tolerance.
-        long: Deviation, relative to the tolerance, of a line from a curve that bends in it as it does beside it; a line
-            with more stays a line.
-        straight: Deviation of the points of such a line from it, relative to the tolerance.
-        chords: Number of chords of the simplified polyline above which an arc or a helix stays as it is.
-    """
-
-    simplified: float = 0.5
-    spline: float = 0.75
-    sagitta: float = 0.05
-    long: float = 4.0
-    straight: float = 0.05
-    chords: int = 8
+    simplified: float = 0.5  # deviation of the simplified polyline that shows the corners, relative to the tolerance
+    spline: float = 0.75  # largest deviation of a spline, relative to the tolerance; the rest is for the vertices
+    sagitta: float = 0.05  # distance of an arc from the chords that stand for it, relative to the tolerance
+    long: float = 4.0  # deviation, relative to the tolerance, from a curve that bends on alike; a line with more stays
+    straight: float = 0.05  # deviation of the points of such a line from it, relative to the tolerance
+    chords: int = 8  # number of chords of the simplified polyline above which an arc or a helix stays as it is
 
 
 RUNS = RunSettings()

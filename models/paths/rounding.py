@@ -36,46 +36,28 @@ Overlap: TypeAlias = Literal["shrink", "refuse"]
 
 @dataclass(frozen=True)
 class RoundingSettings:
-    """Settings of the algorithms that round the corners of a path.
+    """Settings of the algorithms that round the corners of a path."""
 
-    Attributes:
-        samples: Samples of a blend for its deviation, of the neighbourhood of the maximum, and of one turn of a helix
-            for its closest point.
-        reserve: Fraction of the tolerance reserved for deviations between the samples.
-        iterations: Largest number of remaining distances tried, and of rounds that shrink overlapping blends.
-        newton_iterations: Newton iterations to the closest point of a helix or spline.
-        least_slope: Slope of the condition of the closest point below which a step is damped: near the helix axis.
-        block: Corners processed at once, which bounds the memory.
-        shortest: Length, relative to its segment, below which the rest between two blends is a rounding error and
-            dropped.
-        named: Largest number of vertices named in a warning.
-    """
-
-    samples: int = 33
-    reserve: float = 1e-3
-    iterations: int = 60
-    newton_iterations: int = 4
-    least_slope: float = 0.1
-    block: int = 500
-    shortest: float = 1e-12
-    named: int = 12
+    samples: int = 33  # samples of a blend, of the neighbourhood of its maximum, and of one turn of a helix
+    reserve: float = 1e-3  # fraction of the tolerance reserved for deviations between the samples
+    iterations: int = 60  # largest number of remaining distances tried, and of rounds that shrink overlapping blends
+    newton_iterations: int = 4  # Newton iterations to the closest point of a helix or spline
+    least_slope: float = 0.1  # slope of the condition of the closest point below which a step is damped
+    block: int = 500  # corners processed at once, which bounds the memory
+    shortest: float = 1e-12  # relative length below which the rest between two blends is a rounding error
+    named: int = 12  # largest number of vertices named in a warning
 
 
 SETTINGS = RoundingSettings()
 
 
 class _Corners(NamedTuple):
-    """Vertices of a path, and the kind and shape factors of the blends that round them.
-
-    Attributes:
-        shape: Shape factors. Shape (V,).
-        vertices: Indices of the vertices; 0 is the end of the first segment. Shape (V,).
-    """
+    """Vertices of a path, and the kind and shape factors of the blends that round them."""
 
     path: Path
     kind: BlendKind
-    shape: Array
-    vertices: NDArray[np.intp]
+    shape: Array  # shape factors. Shape (V,).
+    vertices: NDArray[np.intp]  # indices of the vertices; 0 is the end of the first segment. Shape (V,).
 
     def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
         """Return the corners with the given indices."""

@@ -163,21 +163,13 @@ class Spline:
 
 
 class SplineTable(NamedTuple):
-    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once.
+    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once."""
 
-    Attributes:
-        curves: Polynomial that each cell is a part of. Shape (C, 6, 3), m.
-        cells: The cells, each with a curve of its own.
-        cell_begins: Distance along the path at which each cell begins. Shape (C,), m.
-        first: First cell of each segment of the path, and finally C. Shape (n + 1,).
-        begins: Distance along the path at which each segment begins. Shape (n,), m.
-    """
-
-    curves: Array
-    cells: Cells
-    cell_begins: Array
-    first: NDArray[np.intp]
-    begins: Array
+    curves: Array  # polynomial that each cell is a part of. Shape (C, 6, 3), m.
+    cells: Cells  # the cells, each with a curve of its own
+    cell_begins: Array  # distance along the path at which each cell begins. Shape (C,), m.
+    first: NDArray[np.intp]  # first cell of each segment of the path, and finally C. Shape (n + 1,).
+    begins: Array  # distance along the path at which each segment begins. Shape (n,), m.
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
@@ -208,32 +200,19 @@ def _between(coefficients: Array, first: Array, last: Array) -> Array:
 
 
 class Polyline(NamedTuple):
-    """Points to fit a spline to, and the tool orientation at the points.
+    """Points to fit a spline to, and the tool orientation at the points."""
 
-    Attributes:
-        points: Shape (N, 3), m; two successive points differ.
-        quaternions: Unit quaternions with continuous signs; between two points the tool turns about a fixed axis, in
-            proportion to the distance. Shape (N, 4). None: the tool does not turn.
-    """
-
-    points: Array
-    quaternions: Array | None = None
+    points: Array  # shape (N, 3), m; two successive points differ
+    quaternions: Array | None = None  # unit, with continuous signs, (N, 4); None: the tool does not turn
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of the fit of a spline to a polyline.
+    """Settings of the fit of a spline to a polyline."""
 
-    Attributes:
-        degree: Degree of the spline; the pieces are quintic polynomials.
-        samples: Least number of samples of the polyline between two knots: twice as many as one knot adds unknowns,
-            for each side of it.
-        end_weight: Weight of both ends, which are then met exactly.
-    """
-
-    degree: int = 5
-    samples: int = 12
-    end_weight: float = 1e3
+    degree: int = 5  # degree of the spline; the pieces are quintic polynomials
+    samples: int = 12  # least samples of the polyline between two knots: twice as many as a knot adds unknowns
+    end_weight: float = 1e3  # weight of both ends, which are then met exactly
 
 
 FIT = FitSettings()

@@ -283,17 +283,11 @@ def _field(spin: Expression, turning: Expression) -> Expression:
 
 
 class MassMoments(NamedTuple):
-    """Mass and first and second mass moments of a set of bodies about the world's origin.
+    """Mass and first and second mass moments of a set of bodies about the world's origin."""
 
-    Attributes:
-        mass: kg.
-        first: Sum of mass times centre of mass. Shape (3, 1), kg m.
-        second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
-    """
-
-    mass: float
-    first: Expression
-    second: Expression
+    mass: float  # kg
+    first: Expression  # sum of mass times centre of mass. Shape (3, 1), kg m.
+    second: Expression  # rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
 
     def plus(self, other: MassMoments) -> MassMoments:
         """Return the mass moments of the union of two disjoint sets of bodies."""

@@ -249,19 +249,13 @@ def constant(array: Array) -> Expression:
 
 
 class LinkMotion(NamedTuple):
-    """Motion of a link in world axes: position, velocity and acceleration of its centre of mass, and its rotation.
+    """Motion of a link in world axes: position, velocity and acceleration of its centre of mass, and its rotation."""
 
-    Attributes:
-        center: Position of the centre of mass. Shape (3, 1), m.
-        velocity, acceleration: Of the centre of mass. Shape (3, 1).
-        angular_velocity, angular_acceleration: Shape (3, 1).
-    """
-
-    center: Expression
-    velocity: Expression
-    acceleration: Expression
-    angular_velocity: Expression
-    angular_acceleration: Expression
+    center: Expression  # position of the centre of mass. Shape (3, 1), m.
+    velocity: Expression  # of the centre of mass. Shape (3, 1).
+    acceleration: Expression  # of the centre of mass. Shape (3, 1).
+    angular_velocity: Expression  # shape (3, 1)
+    angular_acceleration: Expression  # shape (3, 1)
 
 
 class CenterOfMassMotion(NamedTuple):

@@ -137,21 +137,13 @@ def excluded_pairs(source: Source) -> list[tuple[str, str]]:
 
 
 class _ReducedFile(NamedTuple):
-    """An MJCF description reduced to the elements that describe bodies, joints, shapes and actuators.
+    """An MJCF description reduced to the elements that describe bodies, joints, shapes and actuators."""
 
-    Attributes:
-        text: MJCF.
-        name: Name of the model.
-        folder: Folder of the file, "" for a text.
-        files: Files of the meshes, relative to the folder, by their names in the text.
-        origin: Description of the source, for messages.
-    """
-
-    text: str
-    name: str
-    folder: str
-    files: dict[str, Path]
-    origin: str
+    text: str  # MJCF
+    name: str  # name of the model
+    folder: str  # folder of the file, "" for a text
+    files: dict[str, Path]  # files of the meshes, relative to the folder, by their names in the text
+    origin: str  # description of the source, for messages
 
 
 def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:

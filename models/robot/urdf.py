@@ -63,18 +63,12 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Content of a robot description (URDF or MJCF): name, links, joints and tip.
+    """Content of a robot description (URDF or MJCF): name, links, joints and tip."""
 
-    Attributes:
-        name: Name of the robot; "robot" if the file has none.
-        links, joints: In the order of the file.
-        tip: Link that carries the tip, from the non-standard element <tip link="NAME"/>, or None.
-    """
-
-    name: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
-    tip: str | None = None
+    name: str  # name of the robot; "robot" if the file has none
+    links: tuple[Link, ...]  # in the order of the file
+    joints: tuple[Joint, ...]  # in the order of the file
+    tip: str | None = None  # link that carries the tip, from the non-standard element <tip link="NAME"/>, or None
 
 
 def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:

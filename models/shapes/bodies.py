@@ -35,15 +35,10 @@ MAX_CAPSULE_VOLUME = 1.25
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """A mesh of a link, which one or more collision bodies (capsules or a box) cover.
+    """A mesh of a link, which one or more collision bodies (capsules or a box) cover."""
 
-    Attributes:
-        points: Vertices in the frame of the link. Shape (n, 3), m.
-        number: Index of the mesh among the collision shapes of the link.
-    """
-
-    points: Array
-    number: int = 0
+    points: Array  # vertices in the frame of the link. Shape (n, 3), m.
+    number: int = 0  # index of the mesh among the collision shapes of the link
 
     @cached_property
     def hull(self) -> Mesh:
@@ -202,33 +197,21 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
 
 
 class JointStep(NamedTuple):
-    """A moving joint between two rigid parts of a robot (`RigidParts`).
+    """A moving joint between two rigid parts of a robot (`RigidParts`)."""
 
-    Attributes:
-        joint: Its child link names the part below.
-        rotation, translation: Pose of the joint frame in the part above. Shapes (3, 3); (3,), m.
-        above: Name of the part above.
-    """
-
-    joint: Joint
-    rotation: Array
-    translation: Array
-    above: str
+    joint: Joint  # its child link names the part below
+    rotation: Array  # of the joint frame in the part above. Shape (3, 3).
+    translation: Array  # of the joint frame in the part above. Shape (3,), m.
+    above: str  # name of the part above
 
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Sets of links that no moving joint separates; each set is named after the link nearest to the root.
+    """Sets of links that no moving joint separates; each set is named after the link nearest to the root."""
 
-    Attributes:
-        of_link: The part of each link.
-        pose: Rotation and translation of each link in the frame of its part.
-        step: The joint above each part but the root's.
-    """
-
-    of_link: dict[str, str]
-    pose: dict[str, tuple[Array, Array]]
-    step: dict[str, JointStep]
+    of_link: dict[str, str]  # the part of each link
+    pose: dict[str, tuple[Array, Array]]  # rotation and translation of each link in the frame of its part
+    step: dict[str, JointStep]  # the joint above each part but the root's
 
     @classmethod
     def of(cls, robot: Robot) -> RigidParts:

@@ -30,45 +30,25 @@ class CoverSettings:
     """Settings of the search for capsules or a box that cover a mesh.
 
     Lengths and volumes are relative to a mesh whose largest extent is 1.
-
-    Attributes:
-        parts: Largest number of capsules. The distances of more would cost more than their tighter fit saves.
-        worth_a_part: Factor by which the covered volume must fall for each additional part. A lower overhang counts
-            too, by its fourth root.
-        worth_a_box: Volume of the box over that of the capsules below which the box is taken.
-        cuts: Positions of the planes that are tried, relative to the extent along an axis; the best is refined by steps
-            of half and a quarter of the first.
-        growth: Margin added to covers, larger than rounding errors.
-        thinnest: Smallest thickness of a box, which must not be zero.
-        directions: Initial directions of capsule axes on a hemisphere.
-        extremes: Directions whose extreme points take part in a fit, a multiple of 32.
-        trial_directions, trial_extremes: The same for a split that is only tried.
-        simplex: Initial steps of the simplex search: two slopes of the axis, its position across, root of the excess
-            radius.
-        parameter_tolerance, volume_tolerance: Termination tolerances of these parameters and of the relative volume.
-        radii: Initial radii, relative to the enclosing cylinder's.
-        max_triangles: Number of triangles that splits are tried on: the largest ones and the extreme vertices.
-        grid: Number of points that estimate the covered volume, to about one percent.
-        samples: Number of surface points at which the overhang of a cover is measured.
     """
 
-    parts: int = 3
-    worth_a_part: float = 1.07
-    worth_a_box: float = 0.7
-    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)
-    growth: float = 1e-9
-    thinnest: float = 1e-6
-    directions: int = 48
-    extremes: int = 256
-    trial_directions: int = 24
-    trial_extremes: int = 64
-    simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)
-    parameter_tolerance: float = 4e-3
-    volume_tolerance: float = 4e-4
-    radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)
-    max_triangles: int = 1500
-    grid: int = 6000
-    samples: int = 150
+    parts: int = 3  # largest number of capsules; distances of more would cost more than their fit saves
+    worth_a_part: float = 1.07  # factor by which volume (or overhang, by its fourth root) must fall for a part
+    worth_a_box: float = 0.7  # volume of the box over that of the capsules below which the box is taken
+    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
+    growth: float = 1e-9  # margin added to covers, larger than rounding errors
+    thinnest: float = 1e-6  # smallest thickness of a box, which must not be zero
+    directions: int = 48  # initial directions of capsule axes on a hemisphere
+    extremes: int = 256  # directions whose extreme points take part in a fit, a multiple of 32
+    trial_directions: int = 24  # directions for a split that is only tried
+    trial_extremes: int = 64  # extremes for a split that is only tried
+    simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)  # initial steps of the parameters of a capsule
+    parameter_tolerance: float = 4e-3  # termination tolerance of these parameters
+    volume_tolerance: float = 4e-4  # termination tolerance of the relative volume
+    radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)  # initial radii, relative to the enclosing cylinder's
+    max_triangles: int = 1500  # number of triangles that splits are tried on: the largest ones and the extreme vertices
+    grid: int = 6000  # number of points that estimate the covered volume, to about one percent
+    samples: int = 150  # number of surface points at which the overhang of a cover is measured
 
 
 SETTINGS = CoverSettings()
@@ -78,15 +58,10 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes.
+    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes."""
 
-    Attributes:
-        shape: Capsule or box in the frame of the mesh.
-        overhang: Largest distance of sampled surface points of the shape from the convex hull of the mesh, m.
-    """
-
-    shape: CoverShape
-    overhang: float
+    shape: CoverShape  # capsule or box in the frame of the mesh
+    overhang: float  # largest distance of sampled surface points of the shape from the convex hull of the mesh, m
 
 
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:

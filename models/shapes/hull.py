@@ -28,19 +28,12 @@ EDGE_I, EDGE_J = np.triu_indices(3, 1)
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull of points in space: its vertices, triangles and face planes.
+    """A convex hull of points in space: its vertices, triangles and face planes."""
 
-    Attributes:
-        vertices: Corners of the hull. Shape (m, 3), m.
-        faces: Triangles of corners, counter-clockwise from outside. Shape (k, 3).
-        normals: Distinct outward unit normals of the faces. Shape (f, 3).
-        offsets: The hull is the set of x with normals x <= offsets. Shape (f,), m.
-    """
-
-    vertices: Array
-    faces: NDArray[np.intp]
-    normals: Array
-    offsets: Array
+    vertices: Array  # corners of the hull. Shape (m, 3), m.
+    faces: NDArray[np.intp]  # triangles of corners, counter-clockwise from outside. Shape (k, 3).
+    normals: Array  # distinct outward unit normals of the faces. Shape (f, 3).
+    offsets: Array  # the hull is the set of x with normals x <= offsets. Shape (f,), m.
 
 
 def convex_hull(points: Array) -> Hull:

@@ -36,17 +36,11 @@ STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attri
 
 
 class Triangles(NamedTuple):
-    """A triangle mesh: vertices, triangles and their colours.
+    """A triangle mesh: vertices, triangles and their colours."""
 
-    Attributes:
-        vertices: Shape (n, 3), m.
-        faces: Triangles as indices of vertices. Shape (m, 3).
-        colors: Red, green, blue and opacity of each triangle, 0 to 1; nan if the file gives none. Shape (m, 4).
-    """
-
-    vertices: Array
-    faces: Faces
-    colors: Array
+    vertices: Array  # shape (n, 3), m
+    faces: Faces  # triangles as indices of vertices. Shape (m, 3).
+    colors: Array  # red, green, blue and opacity of each triangle, 0 to 1; nan if the file gives none. Shape (m, 4).
 
 
 def without_colors(vertices: Array, faces: Faces) -> Triangles:

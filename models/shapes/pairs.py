@@ -47,23 +47,14 @@ MARGIN_M = 1e-6
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Limits of the computing effort to prove that a pair of bodies need not be checked for collision.
+    """Limits of the computing effort to prove that a pair of bodies need not be checked for collision."""
 
-    Attributes:
-        first_configurations: Random configurations that are tried before a proof.
-        boxes: Boxes of joint positions that a proof may use with up to three joints between the bodies.
-        rounds: Bisections of the boxes.
-        grid: Steps of each of two joints between meshes.
-        refinements: Rounds of finer grids.
-        refined_points: Grid points of smallest distance that a finer grid surrounds.
-    """
-
-    first_configurations: int = 24
-    boxes: int = 2000
-    rounds: int = 40
-    grid: int = 24
-    refinements: int = 3
-    refined_points: int = 8
+    first_configurations: int = 24  # random configurations that are tried before a proof
+    boxes: int = 2000  # boxes of joint positions that a proof may use with up to three joints between the bodies
+    rounds: int = 40  # bisections of the boxes
+    grid: int = 24  # steps of each of two joints between meshes
+    refinements: int = 3  # rounds of finer grids
+    refined_points: int = 8  # grid points of smallest distance that a finer grid surrounds
 
 
 SETTINGS = ProofSettings()
@@ -235,17 +226,11 @@ Poses: TypeAlias = tuple[Array, Array]
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies, with its entry in the joint vector.
+    """A moving joint between two bodies, with its entry in the joint vector."""
 
-    Attributes:
-        column: Index in the joint vector.
-        ratio: Velocity of the joint over that of the entry.
-        arm: Largest distance of the points of one of the bodies from the joint axis, m; 0 for a prismatic joint.
-    """
-
-    column: int
-    ratio: float
-    arm: float
+    column: int  # index in the joint vector
+    ratio: float  # velocity of the joint over that of the entry
+    arm: float  # largest distance of the points of one of the bodies from the joint axis, m; 0 for a prismatic joint
 
     def distance_change(self, half: Array) -> Array:
         """Return the largest change of two bodies' distance if the joint moves by up to `half`, rad or m."""
