@@ -37,10 +37,9 @@ _Kind = TypeVar("_Kind")
 
 
 def check_entries(value: Any) -> None:
-    """Raise ValueError if an array or a nested list has more than `INPUT_LIMITS.array_entries` entries.
+    """Raise ValueError if an array or nested list has more than `INPUT_LIMITS.array_entries` entries.
 
-    The size is estimated before anything is copied, since a view or a range may exceed the memory. The first entry of a
-    list stands for all its entries.
+    The size is estimated before anything is copied; the first entry of a list stands for all its entries.
     """
     limit, entries, part = INPUT_LIMITS.array_entries, 1, value
     for _ in range(INPUT_LIMITS.nesting):  # as many dimensions as numpy's arrays have at most
@@ -57,13 +56,9 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return numbers, an array or a nested list as a new array of floats; raise an error for anything not numeric.
+    """Return numbers, an array or a nested list as a new array of floats; raise one of NOT_NUMBERS for anything else.
 
-    Values that NumPy would silently convert are refused too: text, True, None, symbols (read as nan) and complex
-    numbers.
-
-    Raises:
-        TypeError, ValueError, ...: One of NOT_NUMBERS: the value is not numeric or has too many entries.
+    Values that NumPy would convert are refused too: text, True, None, symbols (read as nan) and complex numbers.
     """
     check_entries(value)
     array = np.asarray(value)
@@ -93,6 +88,11 @@ def freeze(array: Array) -> Array:
     return array
 
 
+def set_fields(instance: Any, **values: Any) -> None:
+    """Set fields of a frozen dataclass during its construction."""
+    vars(instance).update(values)
+
+
 def argument_of(label: str) -> str:
     """Return the name of the argument with which a label ends, such as `scheme` for `Collocation: scheme`."""
     return label.rpartition(" ")[2].strip("'")
@@ -105,12 +105,9 @@ class Checks:
     The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
     "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
     last word of the label, `value`, and `limit`, what is allowed.
-
-    Attributes:
-        error: Class of the exceptions.
     """
 
-    error: type[DetailedError]
+    error: type[DetailedError]  # class of the exceptions
 
     def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
         """Return the exception about an argument that violates a requirement, with label, requirement and value."""
@@ -281,9 +278,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a rotation matrix, shape (3, 3), after checking that it is one; correct rounding errors of its
-        entries.
-        """
+        """Return a rotation matrix, (3, 3), after checking that it is one, without rounding errors."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -333,16 +328,9 @@ def _description(array: Array, wrong: Any) -> str:
 
 
 def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
-    """Warn if an angle (rad) exceeds two turns, since it may be in degrees; values above 1e4 stand for "no limit".
+    """Warn with ModelWarning if an angle (rad) exceeds two turns; values above 1e4 stand for "no limit".
 
-    Python shows the same message only once.
-
-    Args:
-        label: As in `Checks`.
-        name: Field `name` of the warning; the last word of the label if None.
-
-    Warns:
-        ModelWarning: With the angle.
+    `label` is as in `Checks`; `name` is that of the warning, the last word of the label if None.
     """
     words = "rad is more than two turns; angles are in rad, is it in degrees?"
     _warn_of_unit(label, angles, name, (4 * np.pi, 1e4), words)

@@ -38,62 +38,37 @@ import numpy as np
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Largest accepted sizes of input, several times those of the largest known files but small enough for the memory.
+    """Largest accepted sizes of input, several times those of the largest known files."""
 
-    Attributes:
-        count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
-        array_entries: Entries of one array.
-        name_characters: Characters of a link or joint name.
-        description_bytes: Bytes of a URDF, SRDF or MJCF file. The largest public ones have 1 MB.
-        xml_elements: Elements plus attributes of an XML document. Each takes about 200 bytes of memory.
-        mesh_bytes, mesh_text_bytes: Bytes of a binary and a text mesh file. Parsing text takes several times its size.
-        mesh_triangles: Triangles of a scene after all instances are placed.
-        scene_nodes: Nodes of a Collada scene, counted once per instance; parts of bodies in an MJCF file.
-        text_bytes, text_lines, line_characters: Size of waypoint, trajectory and G-code files. A path takes 1 or 2 kB a
-            line.
-        number_characters: Characters of a G-code number.
-        task_bytes: Bytes of a task or obstacle file.
-        nesting: Depth of nested containers, nodes and dotted names.
-        tree_values: Values plus keys of a JSON or YAML file.
-        log_bytes: Bytes of an MCAP file, also after decompression.
-        log_record_bytes: Bytes of a decompressed MCAP record or chunk.
-        log_message_bytes: Bytes of all joint messages of a log, which take five times as much memory.
-    """
-
-    count: int = 1_000_000
-    array_entries: int = 2**22
-    name_characters: int = 500
-    description_bytes: int = 2**23
-    xml_elements: int = 2**20
-    mesh_bytes: int = 2**28
-    mesh_text_bytes: int = 2**26
-    mesh_triangles: int = 2**22
-    scene_nodes: int = 2**12
-    text_bytes: int = 2**25
-    text_lines: int = 500_000
-    line_characters: int = 10_000
-    number_characters: int = 32
-    task_bytes: int = 2**20
-    nesting: int = 64
-    tree_values: int = 2**21
-    log_bytes: int = 2**30
-    log_record_bytes: int = 2**26
-    log_message_bytes: int = 2**26
+    count: int = 1_000_000  # any number that a user chooses, such as a number of nodes
+    array_entries: int = 2**22  # entries of one array
+    name_characters: int = 500  # characters of a link or joint name
+    description_bytes: int = 2**23  # bytes of a URDF, SRDF or MJCF file; the largest public ones have 1 MB
+    xml_elements: int = 2**20  # elements plus attributes of an XML document, each about 200 bytes of memory
+    mesh_bytes: int = 2**28  # bytes of a binary mesh file
+    mesh_text_bytes: int = 2**26  # bytes of a text mesh file, whose parsing takes several times its size
+    mesh_triangles: int = 2**22  # triangles of a scene after all instances are placed
+    scene_nodes: int = 2**12  # nodes of a Collada scene, counted once per instance; parts of bodies in an MJCF file
+    text_bytes: int = 2**25  # bytes of waypoint, trajectory and G-code files; a path takes 1 or 2 kB a line
+    text_lines: int = 500_000  # lines of such a file
+    line_characters: int = 10_000  # characters of a line of such a file
+    number_characters: int = 32  # characters of a G-code number
+    task_bytes: int = 2**20  # bytes of a task or obstacle file
+    nesting: int = 64  # depth of nested containers, nodes and dotted names
+    tree_values: int = 2**21  # values plus keys of a JSON or YAML file
+    log_bytes: int = 2**30  # bytes of an MCAP file, also after decompression
+    log_record_bytes: int = 2**26  # bytes of a decompressed MCAP record or chunk
+    log_message_bytes: int = 2**26  # bytes of all joint messages of a log, which take five times as much memory
 
 
 INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: it is no regular file, is too large, or other users own it or may change it.
+    """Error about a file that is not read: no regular file, too large, or one that other users own or may change."""
 
-    Attributes:
-        value: Size of a file that is too large, bytes; else None.
-        limit: Largest size that is read, bytes; else None.
-    """
-
-    value: int | None = None
-    limit: int | None = None
+    value: int | None = None  # size of a file that is too large, bytes; else None
+    limit: int | None = None  # largest size that is read, bytes; else None
 
 
 def open_regular(path: str | os.PathLike[str], most: int, own: bool = False, links: bool = True) -> BufferedReader:
@@ -160,15 +135,13 @@ UNBOUND_PREFIX = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
 def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTree.Element:
     """Return the root element of an XML document, after checking that it declares no entities and is not too large.
 
-    Args:
-        data: The document.
-        unbound: If given, elements and attributes below the root whose namespace prefix is not declared are left out,
-            elements with all their contents, and their names are appended to this list. If None, a document with such a
-            prefix is not well-formed.
+    If a list `unbound` is given, elements (with all their contents) and attributes below the root whose namespace
+    prefix is not declared are left out, and their names are appended to it.
 
     Raises:
         ElementTree.ParseError: The document is not well-formed.
-        ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is unknown.
+        ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is
+            unknown.
     """
     content = (
         data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")
@@ -250,12 +223,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key of a result: the hexadecimal SHA-256 digest of the data that determine the result.
-
-    Args:
-        version: Version of the code that computes the result, see `source_version`.
-        contents: Arrays or strings that the result depends on.
-    """
+    """Return the cache key, a SHA-256 digest, of a result of a version of the code from given arrays and strings."""
     digest = hashlib.sha256(version.encode())
     for content in contents:
         data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
@@ -268,7 +236,7 @@ def cache_key(version: str, *contents: Any) -> str:
 def source_version(module: str) -> str:
     """Return a digest of the source of a module and of all modules of its package that it imports, even indirectly.
 
-    So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
+    Imports must be written `from PACKAGE... import`.
     """
     sources: dict[str, str] = {}
     waiting = [module]
@@ -289,10 +257,8 @@ def cache_folder() -> Path:
 
 
 def private_folder(make: bool = False) -> Path:
-    """Return the path of the folder of cached results after checking that only this user can change its contents.
-
-    Args:
-        make: Create the folder if it does not exist.
+    """Return the folder of cached results, created if `make`, after checking that only this user can change its
+    contents.
 
     Raises:
         OSError: There is no folder, it is a link, or another user may change it or a folder above it.
@@ -389,12 +355,10 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 @contextmanager
 def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
-    """Lock a cache key for a `with` block, so that only one process or thread at a time computes the value of the key.
+    """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
 
-    If the lock file cannot be created, the block runs without a lock.
-
-    Args:
-        ask: Called every 20 ms while waiting. It may raise to stop waiting.
+    If the lock file cannot be created, the block runs without a lock. `ask` is called every 20 ms while waiting; it may
+    raise to stop waiting.
     """
     lock = None
     with suppress(*UNREADABLE):
@@ -431,9 +395,7 @@ def _library_name(key: str, library: bytes) -> str:
 
 
 def _evict(newest: Path) -> None:
-    """Remove lock files of ended processes from the disk cache, and the least recently used shared libraries until the
-    others together have at most MAX_LIBRARY_BYTES.
-    """
+    """Remove lock files of ended processes, and the least recently used libraries beyond MAX_LIBRARY_BYTES."""
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use

@@ -1,12 +1,11 @@
 """Spatial vector algebra of rigid bodies (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapter 2).
 
-Spatial vectors are (angular, linear): a motion vector is (angular velocity, velocity of the point at the
-frame's origin), a force vector is (moment about the frame's origin, force), a momentum is (moment of momentum
-about the origin, linear momentum). Every function takes SX, MX, DM, NumPy arrays or nested lists and keeps
-structural zeros, so that a planar machine written in three dimensions costs no more than one written in two.
+Spatial vectors are (angular, linear): a motion vector is (angular velocity, velocity of the point at the frame's
+origin), a force vector is (moment about the frame's origin, force). Every function takes SX, MX, DM, NumPy arrays or
+nested lists and keeps structural zeros.
 
-Linear systems and determinants of small matrices are expanded element by element, which keeps expression graphs small.
-So are look-up tables, as piecewise polynomials.
+Linear systems and determinants of small matrices are expanded element by element, look-up tables as piecewise
+polynomials, which keeps expression graphs small.
 """
 
 from __future__ import annotations
@@ -87,9 +86,8 @@ def _is_sequence(value: Any) -> bool:
 def on_scalars(function: _Callable) -> _Callable:
     """Decorate a function of CasADi matrices: for MX arguments, build it with SX symbols and call it as a Function.
 
-    Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
-    with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
-    A flat list of scalars with MX entries counts as an MX column.
+    Element-wise MX graphs are slow to build and to run. Other arguments pass through unchanged. A flat list of scalars
+    with MX entries counts as an MX column.
     """
 
     def column(value: Any) -> Any:
@@ -142,9 +140,7 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
 
 
 def rotation_matrices(vectors: Array) -> Array:
-    """Return the matrices of rotations about the directions of given vectors by their lengths, rad (Rodrigues'
-    formula). Shapes (..., 3) to (..., 3, 3).
-    """
+    """Return the matrices of rotations about given vectors by their lengths, rad. Shapes (..., 3) to (..., 3, 3)."""
     angles = np.linalg.norm(vectors, axis=-1)[..., None, None]
     skews = np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
     versines = np.sinc(angles / (2 * np.pi)) ** 2 / 2  # (1 - cos) / angle^2; np.sinc(x) is sin(pi x) / (pi x)
@@ -179,11 +175,7 @@ def quaternion_product(a: Expression, b: Expression) -> Expression:
 
 
 def rotation_from_quaternion(quaternion: Expression) -> Expression:
-    """Return the rotation matrix of a quaternion [w, x, y, z]. Shape (3, 3).
-
-    Division by the squared norm makes the result a rotation for any non-zero quaternion, so that a state that has
-    drifted off the unit sphere by integration error does not distort shapes.
-    """
+    """Return the rotation matrix of a quaternion [w, x, y, z] of any non-zero norm. Shape (3, 3)."""
     q = expression(quaternion)
     w, x, y, z = q[0], q[1], q[2], q[3]
     s = 2 / (w * w + x * x + y * y + z * z)
@@ -222,19 +214,10 @@ def quaternion_from_rotation(rotation: Array) -> Array:
     return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
 
-def quaternion_rate(quaternion: Expression, angular_velocity: Expression) -> Expression:
-    """Return the time derivative of a body's quaternion from its angular velocity (world axes, rad/s). Shape (4, 1).
-
-    (0, omega) q / 2, which is orthogonal to q, so that the norm is conserved.
-    """
-    omega = expression(angular_velocity)
-    return quaternion_product(ca.vertcat(type(omega)(1, 1), omega), quaternion) / 2
-
-
 def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -> Expression:
     """Return the angular velocity (world axes, rad/s) from a quaternion and its time derivative. Shape (3, 1).
 
-    The inverse of quaternion_rate; the quaternion may have any non-zero norm.
+    The quaternion may have any non-zero norm.
     """
     quaternion = expression(quaternion)
     product = quaternion_product(rate, ca.vertcat(quaternion[0], -quaternion[1:4]))
@@ -249,33 +232,20 @@ def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the matrix that transforms wrenches or momenta from frame B to A, given the pose of B in A. Shape (6, 6).
-
-    The inverse transpose of motion_transform: power does not depend on the frame.
+    """Return the matrix, (6, 6), that transforms wrenches or momenta from frame B to A: motion_transform's inverse
+    transpose.
     """
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
     return ca.vertcat(ca.horzcat(turn, ca.mtimes(skew(position), turn)), ca.horzcat(zero, turn))
 
 
-def motion_cross(velocity: Expression) -> Expression:
-    """Return the matrix of the spatial cross product with a twist, which gives the rate of a twist fixed in a moving
-    body. Shape (6, 6).
-    """
-    v = expression(velocity)
-    zero = type(v)(3, 3)
-    return ca.vertcat(ca.horzcat(skew(v[0:3]), zero), ca.horzcat(skew(v[3:6]), skew(v[0:3])))
-
-
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
     """Return the solution of a linear system with a small, symmetric, positive definite matrix. Shape of `right`.
 
-    L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read. An
-    indefinite matrix is not detected, and a singular one gives inf or nan.
-
-    Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16 (20), 3: 38
-    (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652 (1272).
+    L D L' elimination without pivoting or square roots, meant for n <= 7, with a third of the operations of ca.solve;
+    only the lower triangle is read. An indefinite matrix is not detected, and a singular one gives inf or nan.
     """
     matrix, right = expression(matrix), expression(right)
     size = matrix.shape[0]
@@ -299,10 +269,10 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
 
 @on_scalars
 def determinant(matrix: Expression) -> Expression:
-    """Return the determinant of a small square matrix (n <= 7) without divisions, so that zero pivots give no nan.
+    """Return the determinant, (1, 1), of a small square matrix (n <= 7) without divisions, so that zero pivots give no
+    nan.
 
-    Shape (1, 1). Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
-    Instructions against ca.det: n = 4: 56 (74), 6: 337 (1977).
+    Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
     """
     matrix = expression(matrix)
     size = matrix.shape[0]
@@ -354,8 +324,8 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Return the outputs of a look-up table (CasADi interpolant) as piecewise polynomials, read from the C code that
-    CasADi generates for it.
+    """Return the outputs of a table (CasADi interpolant) as piecewise polynomials, read from the C code generated for
+    it.
     """
     code = ca.CodeGenerator("table")
     code.add(function)
@@ -386,9 +356,8 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial of x, given by breakpoints and coefficients, as one expression without branches.
-
-    Outside all breakpoints the end segments continue if `beyond`, else the value is zero.
+    """Return a piecewise polynomial of x without branches; beyond its breakpoints it continues if `beyond`, else it is
+    zero.
     """
     last = len(breaks) - 2
     total = ca.SX(ca.DM(coefficients[0, 0]))

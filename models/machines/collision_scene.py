@@ -8,46 +8,52 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, require
+from models.checks import Array, require, set_fields
 from models.errors import ModelError
 from models.files import INPUT_LIMITS
-from models.machines.machine import Machine
-from models.machines.pair_gradients import WORLD, PlacedShape, distance_gradients
-from models.robot.kinematics import link_frames
+from models.machines.machine import Machine, base_twists
+from models.robot.kinematics import coupling_matrix, frames_and_axes, link_frames
 from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
-from models.shapes.distance import COLUMNS, column, distance, pair_function, soft_minimum
+from models.shapes.distance import COLUMNS, column, distance, pair_function, pair_wrenches, soft_minima, soft_minimum
 from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, RIGID, SRDF, Pairs, Reason, checked_pairs
 from models.shapes.shapes import KINDS, Box, MovingObstacle, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
+WORLD = -1
+"""Frame index that stands for the world."""
 MIN_SOFTNESS_M = 1e-6
 """Smallest smoothing width of the soft minimum of several distances, m."""
 
 
+class PlacedShape(NamedTuple):
+    """A shape in a collision scene, with its name and the frame that carries it."""
+
+    name: str  # name of its link, with a number if the link has several shapes, or of an obstacle
+    shape: Shape  # shape in the frame that carries it
+    frame: int  # index of that frame among those of `CollisionScene.placements`; -1 for the world
+    link: str  # name of the link that carries the shape, or of the obstacle
+
+
 class Levers(NamedTuple):
-    """Upper bounds on the relative velocity of the two bodies of each of n pairs, per unit rate of each base and joint
-    coordinate.
+    """Upper bounds on the relative velocity of the two bodies of each of n pairs, per unit rate of each coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
-
-    Attributes:
-        base, base_turns: Of the base configuration. Shape (n, base_size).
-        joints, joint_turns: Of the joints. Shape (n, joint_size).
     """
 
-    base: Array
-    base_turns: Array
-    joints: Array
-    joint_turns: Array
+    base: Array  # of the base configuration. Shape (n, base_size).
+    base_turns: Array  # of the base configuration. Shape (n, base_size).
+    joints: Array  # of the joints. Shape (n, joint_size).
+    joint_turns: Array  # of the joints. Shape (n, joint_size).
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,48 +113,42 @@ class CollisionScene:
         obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
         for number, obstacle in enumerate(obstacles):
             name = f"obstacles[{number}]"
-            shape = (
-                obstacle.shape if isinstance(obstacle, MovingObstacle) else checked_shape(f"scene: {name}", obstacle)
-            )
+            moves = isinstance(obstacle, MovingObstacle)
+            shape = obstacle.shape if moves else checked_shape(f"scene: {name}", obstacle)
             if isinstance(shape, Box) and not np.isfinite(shape.size).all():
                 message = f"scene: {name} is an infinite box; give its size, or a HalfSpace"
                 raise ModelError(message, name=name, value=shape.size)
-        object.__setattr__(self, "obstacles", obstacles)
         clearance = require.nonnegative("scene: clearance", self.clearance, unit="m")
-        object.__setattr__(self, "clearance", clearance)
+        set_fields(self, obstacles=obstacles, clearance=clearance)
         robot = getattr(self.machine, "robot", None)
         if not isinstance(robot, Robot):
             message = f"scene: machine must be a FixedBase(robot) or another machine, not {self.machine!r}"
             raise ModelError(message, name="machine", value=self.machine)
         folders = _checked_list(self.folders, "folders")
         own = collision_bodies(robot, folders=folders, missing=self.missing, covered=self.covered)
-        object.__setattr__(self, "covered", _bodies_by_mesh(robot, own))
+        set_fields(self, covered=_bodies_by_mesh(robot, own))
         link_pairs, obstacle_pairs = self._ignored_pairs()
         limits = None if require.flag("scene: limits", self.limits) else (-np.inf, np.inf)
         known = self.classified
         if known is None:
             known = checked_pairs(robot, own, ignored=link_pairs, srdf=self.srdf, clearance=clearance, limits=limits)
-        object.__setattr__(self, "classified", known)
-        object.__setattr__(self, "_parts", RigidParts.of(robot))
+        set_fields(self, classified=known, _parts=RigidParts.of(robot))
         with_obstacles, excluded = self._pairs_with_obstacles(own, obstacle_pairs)
         parts = [self._parts.of_link[body.link] for body in own]
         checked = [(i, j) for i, j in known.checked if parts[i] != parts[j]]
         rigid = {(own[i].link, own[j].link): RIGID for i, j in known.checked if parts[i] == parts[j]}
-        object.__setattr__(self, "excluded", {**known.excluded, **rigid, **excluded})
+        set_fields(self, excluded={**known.excluded, **rigid, **excluded})
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the machine with some joints locked, without pairs of bodies that then cannot move
-        relatively.
+        """Return the scene of the machine with some joints locked, without pairs that then cannot move relatively.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the pairs that the user excludes from collision checks: those of two links, and those with an
-        obstacle.
-        """
+        """Return the pairs that the user excludes from checks: those of two links, and those with an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}
@@ -186,14 +186,11 @@ class CollisionScene:
         for k, (link, body) in enumerate(zip(links, own, strict=True)):
             name = link if links.count(link) == 1 else f"{link}/{links[:k].count(link) + 1}"
             bodies.append(PlacedShape(name, body.shape, indices[link], link))
-        moving = 0
+        moving_frames = count(len(indices))
         for number, obstacle in enumerate(self.obstacles):
-            name = f"obstacle {number}"
-            if isinstance(obstacle, MovingObstacle):
-                bodies.append(PlacedShape(name, obstacle.shape, len(indices) + moving, name))
-                moving += 1
-            else:
-                bodies.append(PlacedShape(name, obstacle, WORLD, name))
+            name, moves = f"obstacle {number}", isinstance(obstacle, MovingObstacle)
+            shape = obstacle.shape if isinstance(obstacle, MovingObstacle) else obstacle
+            bodies.append(PlacedShape(name, shape, next(moving_frames) if moves else WORLD, name))
         pairs = [(i, j, indices[self._reference_link(own[i], own[j])]) for i, j in checked if (i, j) not in covered]
         cover_pairs: dict[int, tuple[tuple[int, int], ...]] = {}
         covers: dict[int, Array] = {}
@@ -213,11 +210,8 @@ class CollisionScene:
                 covers[len(pairs)] = np.array([(i, j) for i in covering[0] for j in covering[1]])
             pairs.append((sides[0], sides[1], indices[self._reference_link(first, second)]))
         pairs += [(i, len(own) + number, WORLD) for i, number in with_obstacles]
-        object.__setattr__(self, "_carriers", tuple(frames))
-        object.__setattr__(self, "bodies", tuple(bodies))
-        object.__setattr__(self, "pairs", np.array(pairs, dtype=int).reshape(-1, 3))
-        object.__setattr__(self, "covers", covers)
-        object.__setattr__(self, "cover_pairs", cover_pairs)
+        set_fields(self, _carriers=tuple(frames), bodies=tuple(bodies), covers=covers, cover_pairs=cover_pairs)
+        set_fields(self, pairs=np.array(pairs, dtype=int).reshape(-1, 3))
 
     def _reference_link(self, first: Body, second: Body) -> str:
         """Return the link farthest from the root that carries both bodies."""
@@ -254,10 +248,7 @@ class CollisionScene:
         return any(isinstance(obstacle, MovingObstacle) for obstacle in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
-        """Return the frames of links and moving obstacles in the world, stacked in one column. Shape (12 F, 1).
-
-        Each of the F frames has its rotation matrix, column by column, and then its position.
-        """
+        """Return rotation and position of each frame of links and moving obstacles as one column. Shape (12 F, 1)."""
         frames = self._frames(base, q, time)
         columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
@@ -287,13 +278,10 @@ class CollisionScene:
         """
         indices, rounding = self._checked_request(pairs, rounding)
         frames = [*self._frames(base, q, time), None]
-        columns: dict[int, Expression] = {}
 
+        @cache
         def column_of(body: int) -> Expression:
-            if body not in columns:
-                placed = self.bodies[body]
-                columns[body] = column(placed.shape, frames[placed.frame])
-            return columns[body]
+            return column(self.bodies[body].shape, frames[self.bodies[body].frame])
 
         def pair_distance(i: int, j: int) -> Expression:
             a, b = self.bodies[i], self.bodies[j]
@@ -311,19 +299,13 @@ class CollisionScene:
     def distance_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> Any:
         """Return the CasADi Function that computes the signed distances of pairs of bodies and their gradients.
 
-        (base, q, time) -> distances (n, 1), m, and gradients for base and q, (n, base_size + joint_size). All pairs of
-        the same two kinds of shapes are evaluated together, and only frames are differentiated: a distance of rigid
-        bodies changes only with their relative twist, through a wrench. That is about fifteen times faster than
-        `distances` and its Jacobian. For a base with a quaternion, gradients hold along rates that keep it a unit
-        quaternion.
-
-        Args, Raises: As in `distances`.
+        (base, q, time) -> distances (n, 1), m, and gradients for base and q, (n, base_size + joint_size), about fifteen
+        times faster than `distances` and its Jacobian. For a base with a quaternion, gradients hold along rates that
+        keep it a unit quaternion. Arguments and errors are those of `distances`.
         """
         indices, rounding = self._checked_request(pairs, rounding)
         groups = [self.cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
-        softness = rounding / 4 + MIN_SOFTNESS_M
-        options: dict[str, Any] = {"groups": groups, "rounding": rounding, "softness": softness}
-        return distance_gradients(self.machine, self.bodies, self._carriers, self._obstacle_frames, **options)
+        return _distance_gradients(self, groups, rounding)
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Return the indices of the requested pairs (None requests all) and the smoothing width after checking both."""
@@ -336,11 +318,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative velocity of each pair of bodies per unit rate of base and joint coordinates.
-
-        Raises:
-            ModelError: A prismatic joint without limits.
-        """
+        """Bounds on the relative velocity of each pair of bodies; ModelError for a prismatic joint without limits."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -373,11 +351,10 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies that are checked by convex hulls of meshes, grouped by mesh, instead of by the
-        covers.
+        """Return the pairs of bodies that are checked by convex hulls of meshes instead of covers, grouped by mesh.
 
-        They have at most three joints between them and may be only millimetres apart by design, closer than the covers
-        of their meshes allow. Pairs of meshes whose covers always collide are included as well.
+        They have at most three joints between them and may be closer by design than the covers of their meshes allow,
+        or their covers always collide.
         """
         pairs: dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]] = {}
         for i, j in checked:
@@ -395,8 +372,7 @@ class CollisionScene:
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
         """Return the velocity bounds (`Levers`) of one body relative to the frame of a link, or to the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
-        joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
-        levers = Levers(base, base_turns, joints, turns)
+        levers = Levers(np.zeros(size), np.zeros(size), np.zeros(robot.dof), np.zeros(robot.dof))
         if not 0 <= placed.frame < len(self._carriers):
             return levers  # an obstacle
         link, base_link = self._carriers[placed.frame], robot.root if reference == WORLD else self._carriers[reference]
@@ -408,17 +384,17 @@ class CollisionScene:
         for (joint, *_), arm in zip(path, lengths, strict=True):
             column, ratio, _ = robot.couplings[joint.name]
             slides = joint.kind == "prismatic"
-            joints[column] += abs(ratio) * (1.0 if slides else arm)
-            turns[column] += 0.0 if slides else abs(ratio)
-        if not np.isfinite(joints).all() or not np.isfinite(reach):
+            levers.joints[column] += abs(ratio) * (1.0 if slides else arm)
+            levers.joint_turns[column] += 0.0 if slides else abs(ratio)
+        if not np.isfinite(levers.joints).all() or not np.isfinite(reach):
             name = next(joint.name for joint, *_ in path if joint.kind == "prismatic")
             message = f"scene: joint {name!r} slides without limits; give it position limits"
             raise ModelError(message, name=name, value=np.inf)
         if reference == WORLD and size:
             planar = size == 3
             # a unit quaternion that changes by dq turns by 2 |dq|
-            base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [2.0 * reach] * 4
-            base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [2.0] * 4
+            levers.base[:] = (1.0, 1.0, reach) if planar else [1.0] * 3 + [2.0 * reach] * 4
+            levers.base_turns[:] = (0.0, 0.0, 1.0) if planar else [0.0] * 3 + [2.0] * 4
         return levers
 
 
@@ -448,3 +424,61 @@ def _pair(value: Any, number: int) -> tuple[str, str]:
         return value[0], value[1]
     message = f"scene: ignored[{number}] must be two names, not {value!r}"
     raise ModelError(message, name="ignored", value=value)
+
+
+def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[int, int]]], rounding: float) -> Any:
+    """Return the Function of `CollisionScene.distance_gradients` for groups of pairs, indices of two bodies.
+
+    Each distance is the minimum over one group.
+    """
+    machine, bodies = scene.machine, scene.bodies
+    base, q, time = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("time")
+    world_from_base = machine.world_from_base(base)
+    links, axes = frames_and_axes(machine.robot, q, world_from_base)
+    frames = [*(links[link] for link in scene._carriers), *scene._obstacle_frames(time), None]
+    screws = ca.horzcat(base_twists(world_from_base, base), *(ca.vertcat(*axis) for axis in axes.values()))
+    pairs = np.array([both for group in groups for both in group], dtype=int).reshape(-1, 2)
+    batches: dict[Any, list[int]] = {}
+    for number, both in enumerate(pairs.tolist()):
+        kinds = tuple(type(bodies[body].shape) for body in both)
+        batches.setdefault(kinds if set(kinds) <= COLUMNS.keys() else None, []).append(number)
+    general = batches.pop(None, [])
+    general_pairs = [[bodies[body] for body in pairs[number]] for number in general]
+    gaps = [distance(a.shape, b.shape, frames[a.frame], frames[b.frame], rounding=rounding) for a, b in general_pairs]
+    general_gaps = ca.vertcat(ca.SX(0, 1), *gaps)
+    sides = [
+        [ca.vertcat(*(column(bodies[k].shape, frames[bodies[k].frame]).T for k in side)) for side in pairs[members].T]
+        for members in batches.values()
+    ]
+    general_gradients = ca.jacobian(general_gaps, ca.vertcat(base, q))
+    parts = ca.cse([ca.SX(screws), general_gaps, general_gradients, *(side for both in sides for side in both)])
+    geometry = ca.Function("posed", [base, q, time], list(map(ca.densify, parts)))
+
+    names = ["base", "q", "time"]
+    arguments = [ca.MX.sym(name, symbol.numel()) for name, symbol in zip(names, (base, q, time), strict=True)]
+    twist_columns, value, gradient, *columns = geometry.call(arguments)
+    signs = _motion_signs(scene, pairs, list(axes))
+    reduction = ca.diagcat(ca.DM.eye(machine.base_size), coupling_matrix(machine.robot))
+    values, rows, order = [value], [gradient], list(general)
+    for k, (kinds, members) in enumerate(batches.items()):
+        gap, wrench = pair_wrenches(kinds[0], kinds[1], rounding, len(members))(*columns[2 * k : 2 * k + 2])
+        joint_gradient = ca.mtimes(wrench, twist_columns) * signs[members]
+        values.append(gap)
+        rows.append(ca.mtimes(joint_gradient, reduction))
+        order += members
+    result = ca.vertcat(*values), ca.vertcat(*rows)
+    if order:
+        positions, counts = np.argsort(order, kind="stable").tolist(), list(map(len, groups))
+        result = soft_minima(*result, positions, counts, softness=rounding / 4 + MIN_SOFTNESS_M)
+    return ca.Function("distances", arguments, result, names, ["distances", "gradients"])
+
+
+def _motion_signs(scene: CollisionScene, pairs: Array, joints: Sequence[str]) -> Array:
+    """Return 1 where a coordinate moves only the first body of a pair, -1 only the second, else 0. Shape (n, k)."""
+    size, carriers = scene.machine.base_size, scene._carriers
+    carried = np.zeros((len(scene.bodies), size + len(joints)))
+    for k, body in enumerate(scene.bodies):
+        if 0 <= body.frame < len(carriers):
+            above = {joint.name for joint in scene.machine.robot.path_to(carriers[body.frame])}
+            carried[k] = [1.0] * size + [float(name in above) for name in joints]
+    return np.asarray(carried[pairs[:, 0]] - carried[pairs[:, 1]])

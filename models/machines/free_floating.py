@@ -1,16 +1,12 @@
 """Arms on an unactuated, freely floating base with conserved momentum, zero by default (Kim and Kim 2011).
 
-The base moves so that E1 x1' + E2 x2' = 0 (equation 24), with x1' the base twist and x2' the joint rates; the tip
-moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A non-zero momentum
-adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
+The base moves so that E1 x1' + E2 x2' = 0 (equation 24), with x1' the base twist and x2' the joint rates; the tip moves
+with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A non-zero momentum adds the
+twist of the whole machine as one rigid body: both become affine in the joint rates.
 
-The base motion is computed about the centre of mass of the machine, where linear and angular momentum decouple, and in
-the axes of the base, where nothing depends on the base's own pose. So only one rotational inertia, of size 3 (1 if
-planar), is inverted instead of E1 of size 6 (3). Instructions of the SX function of G, against the same through
-solve_spd(E1, E2) and ca.solve(E1, E2): spatial base and seven joints 1721 (3451, 4191), the paper's planar example 177
-(337, 389); of the base twist for given joint rates 1230 (2532, 3056) and 127 (240, 292).
-
-A machine in which some base motion carries no momentum is rejected.
+The base motion is computed about the centre of mass, where linear and angular momentum decouple, and in base axes,
+where nothing depends on the base's own pose. So only one rotational inertia, of size 3 (1 if planar), is inverted
+instead of E1. A machine in which some base motion carries no momentum is rejected.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, require
+from models.checks import Array, ArrayInput, require, set_fields
 from models.errors import ModelError
 from models.robot.dynamics import inverse_dynamics, joint_momenta, robot_inertia, subtree_moments
 from models.robot.dynamics import momentum_matrix as joint_momentum_matrix
@@ -92,7 +88,7 @@ class FreeFloating:
         size = len(self.twist_rows)
         momentum = np.zeros(size) if self.conserved_momentum is None else self.conserved_momentum
         momentum = require.array(f"{self.base} free-floating base: conserved_momentum", momentum, (size,))
-        object.__setattr__(self, "conserved_momentum", momentum)
+        set_fields(self, conserved_momentum=momentum)
 
     @property
     def base_size(self) -> int:
@@ -130,9 +126,8 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian, which maps joint rates to the tip's twist less the drift due to momentum.
-
-        Equation (25) of the paper. Shape (6, joint_size).
+        """Return the generalized Jacobian, (6, joint_size), equation (25): from joint rates to the tip's twist less the
+        drift.
         """
         return self._tip_motion(base, self._reaction(q, None, tip=True))
 
@@ -144,10 +139,7 @@ class FreeFloating:
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the twist of the base that conserves the momentum for given joint rates.
-
-        E1^-1 (momentum - E2 joint_rates), equation (24). Shape (6, 1) or (3, 1).
-        """
+        """Return the base twist E1^-1 (momentum - E2 joint_rates), equation (24). Shape (6, 1) or (3, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
@@ -179,13 +171,11 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return the matrices that map the base twist and the joint rates to the total momentum.
+        """Return the matrices E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24) of the
+        paper.
 
-        The momentum is E1 base_twist + E2 joint_rates, equation (24) of the paper.
-
-        Returns:
-            E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's origin, linear
-            momentum), world axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
+        Shapes (6, 6) and (6, joint_size), rows (moment of momentum about the world's origin, linear momentum), world
+        axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
         """
         to_world = force_transform(self.world_from_base(base))
         turn = motion_transform((self.world_from_base(base).rotation, ca.DM(3, 1)))
@@ -196,10 +186,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Return the total momentum (angular about the world's origin, linear), or (Lz, Px, Py) if planar.
-
-        Shape (6, 1) or (3, 1).
-        """
+        """Return the total momentum (angular about the world's origin, linear), (6, 1), or (Lz, Px, Py) if planar."""
         locked, joints = self.momentum_matrices(base, q)
         twist = checked_vector("base_twist", base_twist, len(self.twist_rows), "angular velocity, then linear")
         return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
@@ -208,18 +195,12 @@ class FreeFloating:
     def joint_torques(
         self, base: Expression, q: Expression, joint_rates: Expression, accelerations: Expression
     ) -> Expression:
-        """Return the joint torques (forces of prismatic joints) of a motion without external wrenches.
+        """Return the joint torques (forces of prismatic joints) of a motion without external wrenches. Shape (n, 1), N
+        m or N.
 
         They are computed in base axes. The pose of the base enters only through the conserved momentum h, whose
-        components change as these axes rotate with the angular velocity w: h' = -w x h.
-
-        Args:
-            base, q, joint_rates: Symbols, because the base twist is differentiated in them. Shape (base_size, 1), (n,
-                1) and (n, 1).
-            accelerations: Of the joints. Shape (n, 1).
-
-        Returns:
-            Shape (n, 1), N m or N.
+        components change as these axes rotate with the angular velocity w: h' = -w x h. The arguments are symbols,
+        because the base twist is differentiated in them.
         """
         carried, plane = self._spatial_momentum(), ca.DM.eye(TWIST_SIZE)[:, self.twist_rows]
         momentum = ca.SX.sym("momentum", 0 if carried is None else TWIST_SIZE)
@@ -243,9 +224,8 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion minus the conserved momentum, which is zero for every possible motion.
-
-        The motion is given by the rates of the base configuration and of the joints.
+        """Return the momentum of a motion, given by its rates, minus the conserved momentum; zero for every possible
+        motion.
         """
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
@@ -257,12 +237,9 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return the tip's Jacobians with respect to base twist and joint rates, which are regarded as independent.
+        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates, equation (25) of the paper.
 
-        The tip's twist is F1 base_twist + F2 joint_rates, equation (25) of the paper.
-
-        Returns:
-            F1 of shape (6, 6), (6, 3) for a planar base; F2 of shape (6, joint_size).
+        Shapes (6, 6), or (6, 3) for a planar base, and (6, joint_size).
         """
         turn = self.world_from_base(base).rotation
         frames, axes = frames_and_axes(self.robot, q)
@@ -288,9 +265,8 @@ class FreeFloating:
         return checked_vector("base", base, self.base_size, meaning)
 
     def _spatial_momentum(self) -> tuple[Expression, Expression] | None:
-        """Return the conserved momentum as angular (about the centre of mass) and linear part, or None if it is zero.
-
-        World axes, shape (3, 1) each.
+        """Return the conserved momentum, (angular about the centre of mass, linear), in world axes, or None if it is
+        zero.
         """
         momentum = np.asarray(self.conserved_momentum)
         if not momentum.any():
@@ -316,11 +292,8 @@ class FreeFloating:
     ) -> _Reaction:
         """Return the velocities of base and, if `tip`, of the tip that follow from joint rates and conserved momentum.
 
-        Args:
-            q: Joint positions. Shape (dof, 1).
-            joint_rates: Shape (dof, 1); None for a unit rate of each joint at zero momentum.
-            carried: Conserved momentum, only with given joint rates: (angular about the centre of mass, linear), base
-                axes. Shape (3, 1) each; zero if None.
+        Joint rates of None stand for a unit rate of each joint. `carried` is the conserved momentum (angular about the
+        centre of mass, linear) in base axes, zero if None.
         """
         frames, axes = frames_and_axes(self.robot, q)
         moments = subtree_moments(self.robot, frames)
@@ -352,11 +325,7 @@ class FreeFloating:
 
 
 class _Reaction(NamedTuple):
-    """Velocities of base and tip, in base axes, that follow from joint rates.
-
-    There is one column per joint for unit rates, or one column for given rates, which includes the effect of the
-    conserved momentum. The motion of the tip is None unless requested.
-    """
+    """Velocities of base and tip, in base axes: one column for given joint rates, or one per joint for unit rates."""
 
     base_angular: Expression
     base_linear: Expression
@@ -378,10 +347,7 @@ def _require_planar(robot: Robot) -> None:
 
 
 def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    """Raise ModelError if the robot lacks the inertia by which conserved momentum determines the base motion.
-
-    Only the ratios of the inertias matter, not the units of mass and length.
-    """
+    """Raise ModelError if the robot lacks the inertia by which conserved momentum determines the base motion."""
     if robot.total_mass == 0:
         raise massless_error("without which no momentum tells how its base floats")
     # A stretched chain of point masses lacks inertia about one axis in a single configuration, so several are tried.

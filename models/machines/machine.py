@@ -1,8 +1,7 @@
 """The machine protocol that planners use, the robot on a fixed base as its simplest case, and reaction wheels.
 
-A reaction wheel is an ordinary joint with a rotor. The motor's torque is the joint's effort limit, and the momentum
-h = I w at which the wheel saturates gives its speed limit w. So momentum, torques and limits follow from the robot, for
-FreeFloating machines and in every problem. A rotor is symmetric, so its angle is irrelevant and unbounded.
+A reaction wheel is an ordinary joint with a symmetric rotor. The motor's torque is the joint's effort limit, and the
+momentum h = I w at which the wheel saturates gives its speed limit w.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any, Protocol, cast
 import casadi as ca
 import numpy as np
 
-from models.checks import ROUNDING, Array, ArrayInput, require, short_repr
+from models.checks import ROUNDING, Array, ArrayInput, require, set_fields, short_repr
 from models.errors import ModelError
 from models.robot.kinematics import (
     TWIST_SIZE,
@@ -29,7 +28,7 @@ from models.robot.kinematics import (
 from models.robot.parts import Joint, Link
 from models.robot.rebuild import lock_joints, move_tip
 from models.robot.robot import Robot
-from models.spatial import Expression, Frame, expression, on_scalars
+from models.spatial import Expression, Frame, cross, expression, on_scalars
 
 
 class Machine(Protocol):
@@ -66,24 +65,21 @@ class Machine(Protocol):
         """Return the frame of the tip in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the matrix from joint rates to the tip's twist, including the base motion that joint motion causes.
-
-        Shape (6, joint_size).
+        """Return the matrix, (6, joint_size), from joint rates to the tip's twist, including the base motion that they
+        cause.
         """
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the tip's twist for given joint rates, including the drift due to conserved momentum.
-
-        It is tip_jacobian times joint_rates, in fewer operations, plus the drift. Shape (6, 1).
+        """Return the tip's twist, tip_jacobian times joint_rates plus the drift due to conserved momentum. Shape (6,
+        1).
         """
 
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Return the rate of the base configuration, including the drift due to momentum. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of a task that fixes components of the tip's twist, see jacobian_manipulability.
-
-        Shape (1, 1).
+        """Return the manipulability of a task that fixes rows of the tip's twist, see jacobian_manipulability. Shape
+        (1, 1).
         """
 
 
@@ -111,8 +107,8 @@ class FixedBase:
             names = [link.name for link in self.robot.links]
             raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
         owner = "fixed base"
-        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
-        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
+        set_fields(self, translation=require.array(f"{owner}: translation", self.translation, (3,)))
+        set_fields(self, rotation=require.rotation(f"{owner}: rotation", self.rotation))
 
     @property
     def base_size(self) -> int:
@@ -145,7 +141,7 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """CasADi Function from joint positions to the tip's pose, built once because that takes long."""
+        """CasADi Function from joint positions to the tip's pose, built once."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
@@ -162,10 +158,7 @@ class FixedBase:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the rate of the base configuration: an empty column, because the base is fixed. Shape (0, 1).
-
-        It has the type of the joint rates.
-        """
+        """Return the rate of the base configuration, an empty column of the type of the joint rates. Shape (0, 1)."""
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
@@ -194,7 +187,7 @@ def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
     """Return the machine with some joints, and those that mimic them, locked at given positions (rad or m, by name).
 
     Raises:
-        ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
+        ModelError: As `models.robot.rebuild.lock_joints` and `with_tip`.
     """
     return cast(Machine, replace(_with_robot(machine), robot=lock_joints(machine.robot, positions)))
 
@@ -205,6 +198,19 @@ def _with_robot(machine: Machine) -> Any:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)
     return machine
+
+
+def base_twists(world_from_base: Frame, base: Expression) -> Expression:
+    """Return the twist (angular, linear at the world's origin) of the base per unit rate of its coordinates. Shape (6,
+    size).
+    """
+    orientation, position = (ca.SX(part) for part in world_from_base)
+    twists = []
+    for k in range(base.numel()):
+        spin = ca.mtimes(ca.reshape(ca.jacobian(ca.vec(orientation), base[k]), 3, 3), orientation.T)
+        angular = ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
+        twists.append(ca.vertcat(angular, ca.jacobian(position, base[k]) + cross(position, angular)))
+    return ca.horzcat(ca.SX(6, 0), *twists)
 
 
 def with_wheels(

@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, require, warn_of_degrees, warn_of_millimetres
+from models.checks import Array, ArrayInput, require, set_fields, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.paths import SmoothPath
 from models.robot.kinematics import checked_vector
@@ -56,13 +56,11 @@ class Scara:
     def __post_init__(self) -> None:
         for field in ("upper_arm", "forearm"):
             length = require.positive(f"scara: {field}", getattr(self, field), unit="m")
-            object.__setattr__(self, field, length)
+            set_fields(self, **{field: length})
             warn_of_millimetres(f"scara: {field}", length)
-        object.__setattr__(self, "mount", require.array("scara: mount", self.mount, (3,)))
+        set_fields(self, mount=require.array("scara: mount", self.mount, (3,)))
         for field in ("lower", "upper"):
-            object.__setattr__(
-                self, field, require.array(f"scara: {field}", getattr(self, field), (4,), entries="numbers")
-            )
+            set_fields(self, **{field: require.array(f"scara: {field}", getattr(self, field), (4,), entries="numbers")})
         names = () if isinstance(self.names, str) else require.each("scara: names", self.names, str)
         if len(set(names) - {""}) != 4 or len(names) != 4:
             message = f"scara: joint names {list(self.names)} must be four that differ"
@@ -137,13 +135,10 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi that shifts a range of positions into the joint's limits; None if there is none.
+        """Return the multiple of 2 pi, zero for the quill, that shifts positions from `least` to `most` into a joint's
+        limits.
 
-        The tolerance is 1e-9. The result is always 0 for the quill, which is prismatic.
-
-        Args:
-            joint: Index.
-            least, most: Ends of the range, rad or m.
+        None if there is none; the tolerance is 1e-9.
         """
         low, high = float(self.lower[joint]) - 1e-9, float(self.upper[joint]) + 1e-9
         turn = 0.0
@@ -174,10 +169,8 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from tool pose and its derivatives to joint positions and their derivatives.
-
-        A pose is (x, y, z, yaw). Three derivatives each, with respect to the same parameter; inputs and outputs have 4
-        entries each.
+        """Return the CasADi Function from tool pose (x, y, z, yaw) and three derivatives to joints and three
+        derivatives.
         """
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
@@ -204,10 +197,7 @@ ANGLES = [0, 1, 3]
 
 
 class JointsAlong(NamedTuple):
-    """Joint positions along a path and their first three derivatives with respect to arc length.
-
-    Shape (M, 4) each, rad and m, per m, m^2, m^3.
-    """
+    """Joint positions along a path and three derivatives by arc length. Shape (M, 4) each, rad and m."""
 
     position: Array
     first: Array
@@ -217,23 +207,14 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them.
+    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them."""
 
-    Attributes:
-        scara: The arm.
-        path: Path of the tool.
-        elbow: Side of the elbow along the whole path.
-        rates: Function of the pose and its derivatives, see `Scara.inverse_rates`.
-        table: Arc lengths (m) and continuous joint positions, dense enough to tell full turns. Shape (K,) and (K, 4).
-        turns: Whole turns added to the joints so that they keep their limits. Shape (4,), rad.
-    """
-
-    scara: Scara
-    path: SmoothPath
-    elbow: Elbow
-    rates: Any
-    table: tuple[Array, Array]
-    turns: Array
+    scara: Scara  # the arm
+    path: SmoothPath  # path of the tool
+    elbow: Elbow  # side of the elbow along the whole path
+    rates: Any  # function of the pose and its derivatives, see `Scara.inverse_rates`
+    table: tuple[Array, Array]  # arc lengths (K,), m, and continuous joints (K, 4), dense enough to tell turns
+    turns: Array  # whole turns added to the joints so that they keep their limits. Shape (4,), rad.
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -348,14 +329,8 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return the place (arc length) and value of the maximum (sign 1) or minimum (-1) of a function, given samples.
-
-    The extremum is refined between the samples.
-
-    Args:
-        function: Of arc lengths, shape (M,) to (M,).
-        s, values: Samples that resolve it. Shape (K,).
-        sign: 1 or -1.
+    """Return place (arc length) and value of the maximum (sign 1) or minimum (-1) of a function, refined between
+    samples.
     """
     padded = np.concatenate([[-np.inf], sign * values, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))

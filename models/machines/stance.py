@@ -1,8 +1,7 @@
 """Machines that stand on several feet, each fixed on a foothold: contact loads and conditions for lasting contact.
 
 While the feet do not move, the machine is one on a fixed base, rooted at its first foot. The loads of the other feet
-close the kinematic loops, and the first foot bears the rest. A foot is a sole, whose contact can push but not pull, or
-a grip, which can bear any load, as of a docked base.
+close the kinematic loops, and the first foot bears the rest.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any, Self
 import casadi as ca
 import numpy as np
 
-from models.checks import ROUNDING, Array, ArrayInput, require
+from models.checks import ROUNDING, Array, ArrayInput, require, set_fields
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support, convex_hull, footprint
@@ -53,8 +52,8 @@ class Foot:
         owner = f"foot {require.name('foot: link', self.link)!r}"
         if self.sole is not None:
             require.instance(f"{owner}: sole", self.sole, Support)
-        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
-        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
+        set_fields(self, translation=require.array(f"{owner}: translation", self.translation, (3,)))
+        set_fields(self, rotation=require.rotation(f"{owner}: rotation", self.rotation))
 
     @classmethod
     def of(cls, robot: Robot, link: str, rotation: ArrayInput = None) -> Self:
@@ -93,8 +92,8 @@ class Foothold:
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", require.array("foothold: position", self.position, (3,), unit="m"))
-        object.__setattr__(self, "rotation", require.rotation("foothold: rotation", self.rotation))
+        set_fields(self, position=require.array("foothold: position", self.position, (3,), unit="m"))
+        set_fields(self, rotation=require.rotation("foothold: rotation", self.rotation))
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
@@ -231,12 +230,11 @@ class Stance(FixedBase):
     def load_rows(self) -> dict[str, tuple[int, ...]]:
         """Indices of those components of a foot's twist that the joints can change, for each foot but the first.
 
-        In world axes, they are all six, or three in a plane, also for feet in the air. The load of a foot has the same
-        rows: nothing resists the others.
+        In world axes, they are all six, or three in a plane. The load of a foot has the same rows: nothing resists the
+        others.
 
         Raises:
-            ModelError: These rows are dependent in every configuration, because the robot's plane is oblique to the
-                axes.
+            ModelError: These rows are always dependent, because the robot's plane is oblique to the axes.
         """
         rng = np.random.default_rng(0)
         rows_of_feet = {}
@@ -262,9 +260,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return all six components of a foot's load from those in `load_rows`; the others are always zero. Shape (6,
-        1).
-        """
+        """Return all six components, (6, 1), of a foot's load from those in `load_rows`; the others are always zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -277,13 +273,11 @@ class Stance(FixedBase):
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
-        """Return the moments of a foot's load about the edges of its sole, nonnegative while the foot does not tip.
+        """Return the moments, (k, 1), of a foot's load about the edges of its sole, nonnegative while the foot does not
+        tip.
 
-        Each is the distance of the center of pressure from an edge, less a margin, times the pressure, N m. Only edges
-        from which motion can change that distance count. Shape (k, 1); none for a grip.
-
-        Args:
-            margin: Distance by which the edges are moved inwards, m.
+        Each is the distance of the center of pressure from an edge, less a margin (m), times the pressure, N m. Only
+        edges from which motion can change that distance count; a grip has none.
 
         Raises:
             ModelError: The center of pressure is beyond another edge in every motion.
@@ -335,7 +329,7 @@ class Stance(FixedBase):
 
         (mu f_z)^2 - f_x^2 - f_y^2 - (m_z / c)^2 with the moment m_z about the normal through the middle of the sole and
         c two thirds of the radius of the largest circle in it: the ellipsoid of Howe and Cutkosky (1996). Shape (1, 1);
-        empty, (0, 1), for a grip.
+        (0, 1) for a grip.
         """
         sole = self.feet[name].sole
         if sole is None:
@@ -358,9 +352,8 @@ class Stance(FixedBase):
         return Support(convex_hull(np.vstack(points)))
 
     def zero_moment_point(self, loads: Mapping[str, Expression]) -> Expression:
-        """Return the zero moment point of the feet's loads at the height of the first foothold. Shape (2, 1), m.
-
-        The loads have no horizontal moment about this point.
+        """Return the zero moment point, about which the loads have no horizontal moment, at the first foothold. Shape
+        (2, 1), m.
         """
         moment, force = ca.DM(3, 1), ca.DM(3, 1)
         positions = [np.asarray(self.footholds[name].position) for name in loads]

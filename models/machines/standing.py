@@ -1,8 +1,7 @@
 """Robots that stand unfixed on level ground: ground reaction, zero moment point, stability (Yoo et al. 2004).
 
 The ground is the plane z = 0 of the world, z upwards. While the foot stays flat on it, the machine is one on a fixed
-base; whether it stays is decided by the required ground reaction. A StandingMotion evaluates the ground reaction and
-the joint loads of a motion at sampled times.
+base; whether it stays is decided by the required ground reaction.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.checks import ROUNDING, Array, ArrayInput, require
+from models.checks import ROUNDING, Array, ArrayInput, require, set_fields
 from models.errors import ModelError
 from models.machines.machine import FixedBase
 from models.machines.support import Support
@@ -38,10 +37,8 @@ External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return the external wrenches at a time and tip position, an empty tuple if `external` is None.
-
-    Raises:
-        ModelError: `external` is neither None nor a function that returns wrenches.
+    """Return the external wrenches at a time and tip position; raise ModelError unless `external` is None or a
+    function.
     """
     if external is None:
         return ()
@@ -55,22 +52,14 @@ class ZmpRows(NamedTuple):
     """Coefficients of the linear condition on joint accelerations that keeps the zero moment point at a given position.
 
     J_m q'' + q'^T H_m q' = C, equation (18) of the paper. Row 0 fixes x, row 1 y, as moments about the position, N m.
-
-    Attributes:
-        jacobian: J_m. Shape (2, n).
-        hessians: The two planes of H_m, symmetric. Shape (n, n) each.
-        right: C, with gravity and the wrenches. Shape (2, 1).
     """
 
-    jacobian: Expression
-    hessians: tuple[Expression, Expression]
-    right: Expression
+    jacobian: Expression  # J_m. Shape (2, n).
+    hessians: tuple[Expression, Expression]  # the two planes of H_m, symmetric. Shape (n, n) each.
+    right: Expression  # C, with gravity and the wrenches. Shape (2, 1).
 
     def needed(self, qd: Expression) -> Expression:
-        """Return the moments, about the zero moment point, that joint accelerations must produce. Shape (2, 1), N m.
-
-        They are J_m q'' = C - q'^T H_m q'.
-        """
+        """Return J_m q'' = C - q'^T H_m q', the moments that joint accelerations must produce. Shape (2, 1), N m."""
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 
@@ -107,12 +96,12 @@ class Standing(FixedBase):
         if self.robot.total_mass == 0:
             raise massless_error("nothing presses its foot on the ground")
         gravity = require.positive(f"{owner}: gravity", self.gravity, unit="m/s^2")
-        object.__setattr__(self, "gravity", gravity)
+        set_fields(self, gravity=gravity)
         point = self.support.center if self.most_stable_point is None else self.most_stable_point
         widths = self.support.half_widths if self.half_widths is None else self.half_widths
-        object.__setattr__(self, "most_stable_point", require.array(f"{owner}: most_stable_point", point, (2,)))
+        set_fields(self, most_stable_point=require.array(f"{owner}: most_stable_point", point, (2,)))
         widths = require.array(f"{owner}: half_widths", widths, (2,), sign="positive", unit="m")
-        object.__setattr__(self, "half_widths", widths)
+        set_fields(self, half_widths=widths)
 
     @property
     def weight(self) -> float:
@@ -144,10 +133,10 @@ class Standing(FixedBase):
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Return the zero moment point, about which the ground reaction has no horizontal moment.
+        """Return the zero moment point, (2, 1), m, about which the ground reaction has no horizontal moment.
 
-        Equations (2), (3) and, corrected, (35), (36) of the paper. Shape (2, 1), m. Only meaningful while the vertical
-        force is positive.
+        Equations (2), (3) and, corrected, (35), (36) of the paper; only meaningful while the vertical force is
+        positive.
         """
         return center_of_pressure(self.ground_reaction(q, qd, qdd, wrenches))
 
@@ -162,23 +151,13 @@ class Standing(FixedBase):
         return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:
-        """Return the stability indices of a zero moment point in x and y. Shape (2, 1).
-
-        1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6) of the paper: 1 at the most stable
-        point, 0 at the half-widths from it.
-        """
+        """Return 1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6). Shape (2, 1)."""
         offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the joint acceleration constraint that fixes the zero moment point at `point`.
-
-        Equation (18) of the paper.
-
-        Args:
-            q, qd: Shape (n, 1) each.
-            point: (x, y) on the ground. Shape (2,), m.
-            wrenches: External wrenches; they enter C.
+        """Return the condition, (18) of the paper, that fixes the zero moment point at `point`, (2,), m; wrenches enter
+        C.
         """
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector("point", point, 2, "x and y on the ground")
@@ -214,10 +193,7 @@ class Standing(FixedBase):
 
     @cached_property
     def moving_directions(self) -> Array:
-        """Orthonormal directions on the ground in which joint motion can shift the zero moment point. Shape (k, 2).
-
-        Both axes if k = 2; one direction for a machine that moves in a vertical plane.
-        """
+        """Orthonormal directions on the ground in which joint motion can shift the zero moment point. Shape (k, 2)."""
         _, sizes, directions = np.linalg.svd(self._sampled_points - self._sampled_points.mean(axis=0))
         count = int((sizes > 1e-9 * max(1.0, sizes[0])).sum())
         if count == 2:
@@ -242,10 +218,7 @@ class Standing(FixedBase):
 
 
 def center_of_pressure(reaction: Expression) -> Expression:
-    """Return the zero moment point (x, y) of a ground reaction (moment about the world's origin, force).
-
-    Shape (2, 1), m.
-    """
+    """Return the zero moment point, (2, 1), m, of a ground reaction (moment about the world's origin, force)."""
     reaction = checked_vector("reaction", reaction, 6, "moment about the world's origin and force")
     return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
 
@@ -269,46 +242,27 @@ Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
 
 @dataclass(frozen=True)
 class StandingMotion:
-    """A motion of a standing machine at M sampled times, with the joint torques and ground reaction it requires.
+    """A motion of a standing machine at M sampled times, with the joint torques and ground reaction it requires."""
 
-    Attributes:
-        t: Times. Shape (M,), s.
-        joints, joint_velocities, joint_accelerations: Shape (M, n).
-        joint_torques: By inverse dynamics. Shape (M, n), N m or N.
-        tip_in_world: Shape (M, 3), m.
-        external_force: Sum of the external forces, wherever they act, world axes. Shape (M, 3), N.
-        center_of_mass: Shape (M, 3), m.
-        ground_force: Force of the ground on the foot. Shape (M, 3), N.
-        zero_moment_point: (x, y). Shape (M, 2), m.
-        index: Stability index in x and y, equations (5) and (6). Shape (M, 2).
-        foot_margin: Signed distance of the zero moment point from the edge of the support. Shape (M,), m.
-        joint_excess: Largest violation of a joint limit, negative inside. Shape (M,), rad or m.
-        joint_limit_index: p1, equation (23). Shape (M,).
-        manipulability: p2, equation (27), of the task's rows. Shape (M,).
-    """
-
-    t: Array
-    joints: Array
-    joint_velocities: Array
-    joint_accelerations: Array
-    joint_torques: Array
-    tip_in_world: Array
-    external_force: Array
-    center_of_mass: Array
-    ground_force: Array
-    zero_moment_point: Array
-    index: Array
-    foot_margin: Array
-    joint_excess: Array
-    joint_limit_index: Array
-    manipulability: Array
+    t: Array  # times. Shape (M,), s.
+    joints: Array  # shape (M, n)
+    joint_velocities: Array  # shape (M, n)
+    joint_accelerations: Array  # shape (M, n)
+    joint_torques: Array  # by inverse dynamics. Shape (M, n), N m or N.
+    tip_in_world: Array  # shape (M, 3), m
+    external_force: Array  # sum of the external forces, wherever they act, world axes. Shape (M, 3), N.
+    center_of_mass: Array  # shape (M, 3), m
+    ground_force: Array  # force of the ground on the foot. Shape (M, 3), N.
+    zero_moment_point: Array  # (x, y). Shape (M, 2), m.
+    index: Array  # stability index in x and y, equations (5) and (6). Shape (M, 2).
+    foot_margin: Array  # signed distance of the zero moment point from the edge of the support. Shape (M,), m.
+    joint_excess: Array  # largest violation of a joint limit, negative inside. Shape (M,), rad or m.
+    joint_limit_index: Array  # p1, equation (23). Shape (M,).
+    manipulability: Array  # p2, equation (27), of the task's rows. Shape (M,).
 
     @property
     def friction(self) -> Array:
-        """Coefficient of friction that the motion requires at each sample; inf without contact. Shape (M,).
-
-        It is the horizontal over the vertical ground force.
-        """
+        """Horizontal over vertical ground force, the friction coefficient required; inf without contact. Shape (M,)."""
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
@@ -359,10 +313,9 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function that computes the derived quantities of a `StandingMotion` by name.
+    """Return the CasADi Function (time, q, qd, qdd) -> the computed attributes of a `StandingMotion`, by name.
 
-    (time, q, qd, qdd) -> joint torques, then the other computed attributes. Its symbols are SX, or MX if `external`
-    requires it.
+    Its symbols are SX, or MX if `external` requires it.
     """
     try:
         return _motion_function(machine, external, rows, ca.SX)
@@ -386,7 +339,7 @@ def standing_motion(
         machine: Standing machine.
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
-        external: External wrenches as a function of time and tip position.
+        external: External wrenches.
         rows: Task of the reported manipulability.
 
     Raises:
@@ -401,10 +354,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Evaluate a function that `motion_function` returned at M times, and return its outputs by name.
-
-    Shape (M, k), or (M,) for scalars.
-    """
+    """Evaluate a result of `motion_function` at M times; return its outputs by name: (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models.checks import ROUNDING, Array, ArrayInput, freeze, require
+from models.checks import ROUNDING, Array, ArrayInput, freeze, require, set_fields
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector, link_frames
 from models.robot.parts import CollisionShape
@@ -63,7 +63,7 @@ class Support:
         if angles.sum() > 3 * np.pi:
             message = f"support: the polygon {corners.tolist()} crosses itself; give its corners in order"
             raise ModelError(message, name="vertices", value=corners)
-        object.__setattr__(self, "vertices", freeze(corners[np.roll(angles, 1) > ROUNDING]))
+        set_fields(self, vertices=freeze(corners[np.roll(angles, 1) > ROUNDING]))
 
     @property
     def area(self) -> float:

@@ -1,11 +1,10 @@
 """Task paths of lines, arcs, helices and splines with tool orientation and rounded corners, by distance."""
 
-from models.paths.blends import gamma, rest_to_rest
-from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function
+from models.paths.blends import gamma, gauss_newton, march, predictor_corrector, rest_to_rest
 from models.paths.path import Path, fit_splines, split_at_reversals
 from models.paths.rounding import smooth
 from models.paths.segments import Arc, Helix, Line, Segment
-from models.paths.smooth_path import Blend, PathPoint, SmoothPath, Turn
+from models.paths.smooth_path import Blend, PathPoint, SmoothPath, Turn, path_function, turn_function
 from models.paths.splines import Spline
 
 __all__ = [

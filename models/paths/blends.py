@@ -2,24 +2,19 @@
 
 The remaining distance is that from the vertex to both ends of the blend, along the segments. The cubic of Lee, Ryu,
 Cheong 2006, eqs (1)-(9), has the end tangents alpha n1, alpha n2 with alpha = shape * remaining (9), where n1, n2 are
-the unit tangents of the segments and shape is the shape factor. With the shape factor 3 its end curvature between lines
-is exactly zero for every angle; next to an arc it differs from that of the arc. The quintic prescribes the second
-derivative as well and so matches the curvature of every neighbour.
+the unit tangents of the segments. With the shape factor 3 its end curvature between lines is exactly zero. The quintic
+prescribes the second derivative as well and so matches the curvature of every neighbour.
 
 Polynomials are ascending: r(u) = sum_k coefficients[k] u^k, u in [0, 1]. Shape (..., 6, 3), a cubic padded with zeros.
 `angle` is the interior angle at the vertex: pi for a straight line, small for a sharp corner.
 
-The best shape factor has the least peak curvature of the quintic. A constant speed v is limited by v^2 curvature =
-centripetal limit, so this blend is the fastest of all with the same remaining distance. A small factor concentrates
-the curvature near the ends, a large one in the middle. The peak therefore has one minimum in between, or an interval
-of minima if a neighbour's own curvature is the peak. A coarse grid and a golden-section search find it. Between two
-lines it depends on the angle alone and is tabulated; next to arcs it also depends on their curvatures times the
-remaining distance. A tangent joint of line and arc keeps the arc's own curvature and full speed, where the factor 1.5
-permits 0.79 of it.
+The best shape factor has the least peak curvature of the quintic, hence the highest constant speed. The peak has one
+minimum over the factor, or an interval of minima if a neighbour's own curvature is the peak. Between two lines the
+factor depends on the angle alone and is tabulated.
 
-The arc length is computed to rounding. The speed |dr/du| is analytic but nearly singular in the middle of a sharp
-corner. Each curve is therefore split into cells, intervals of u, in which the 10-point Gauss-Legendre rule is exact to
-rounding and the cubic Hermite guess of the inverse is monotone, from which Chebyshev's method converges.
+The arc length is computed to rounding. Each curve is split into cells, intervals of u, in which the 10-point Gauss-
+Legendre rule is exact to rounding and the cubic Hermite guess of the inverse is monotone, from which Chebyshev's method
+converges.
 """
 
 from __future__ import annotations
@@ -27,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
@@ -69,10 +64,9 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Return the minimum-jerk time scaling from rest to rest at a fraction of the duration.
+    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 from rest to rest at a fraction s of the duration.
 
-    10 s^3 - 15 s^4 + 6 s^5 for the fraction s, 0 to 1, is the polynomial of least degree whose velocity and
-    acceleration are zero at both ends. Accepts numbers, arrays and expressions.
+    Accepts numbers, arrays and expressions.
     """
     if not isinstance(s, ca.SX | ca.MX | ca.DM):
         s = require.array("rest_to_rest: s", s)
@@ -80,9 +74,10 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the coefficients of the cubic curve with given end points and first derivatives at the ends.
+    """Return the coefficients of the cubic curve with given end points and first derivatives, eqs (1) to (7) of the
+    paper.
 
-    Equations (1) to (7) of the paper; the derivatives are in the curve parameter u. Shapes (..., 3) to (..., 6, 3).
+    The derivatives are in the curve parameter u. Shapes (..., 3) to (..., 6, 3).
     """
     chord = end - start
     zero = np.zeros_like(chord)
@@ -101,17 +96,12 @@ def quintic(start: End, end: End) -> Array:
     value = end_value - start_value - start_rate - start_second / 2
     rate = end_rate - start_rate - start_second
     bend = end_second - start_second
-    return np.stack(
-        [
-            start_value,
-            start_rate,
-            start_second / 2,
-            10 * value - 4 * rate + bend / 2,
-            -15 * value + 7 * rate - bend,
-            6 * value - 3 * rate + bend / 2,
-        ],
-        axis=-2,
+    third, fourth, fifth = (
+        10 * value - 4 * rate + bend / 2,
+        -15 * value + 7 * rate - bend,
+        6 * value - 3 * rate + bend / 2,
     )
+    return np.stack([start_value, start_rate, start_second / 2, third, fourth, fifth], axis=-2)
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
@@ -133,8 +123,8 @@ def _falling_factorials(order: int) -> list[float]:
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
     """Return the distance of a blend's middle from its corner between two lines, relative to that of the blend's ends.
 
-    |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, eq. (8): the distance at u
-    = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
+    Equation (8): |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, the distance
+    at u = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
     for name, value in (("shape", shape), ("angle", angle)):
         require.positive(f"corner: {name}", value)
@@ -164,40 +154,26 @@ def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class ShapeSearch:
-    """Settings of the search for the shape factor that gives a blend the least peak curvature.
+    """Settings of the search for the shape factor that gives a blend the least peak curvature."""
 
-    Attributes:
-        narrowest, widest: Range searched for the factor times remaining distance over the chord; between two lines the
-            best lies from 0.885 to 2.44.
-        below_cusp: Upper limit of the factor, relative to that of the cusp.
-        coarse: Number of factors of the coarse grid.
-        steps: Golden-section steps between the neighbours of the best.
-        samples: Samples of a blend for its peak curvature.
-        table_angles, table_samples: Corners of the table, and samples of each.
-        least_angle: Smallest angle of the table, rad; below, the best factor over the sine of half the angle is
-            constant.
-        block: Corners processed at once, which bounds the memory.
-    """
-
-    narrowest: float = 0.5
-    widest: float = 3.0
-    below_cusp: float = 0.95
-    coarse: int = 9
-    steps: int = 16
-    samples: int = 49
-    table_angles: int = 65
-    table_samples: int = 201
-    least_angle: float = 1e-3
-    block: int = 500
+    narrowest: float = 0.5  # range of the factor times remaining distance over the chord, between lines 0.885 to 2.44
+    widest: float = 3.0  # upper end of this range
+    below_cusp: float = 0.95  # upper limit of the factor, relative to that of the cusp
+    coarse: int = 9  # number of factors of the coarse grid
+    steps: int = 16  # golden-section steps between the neighbours of the best
+    samples: int = 49  # samples of a blend for its peak curvature
+    table_angles: int = 65  # corners of the table
+    table_samples: int = 201  # samples of each of these corners
+    least_angle: float = 1e-3  # smallest angle of the table, rad; below, factor over sine of half the angle is constant
+    block: int = 500  # corners processed at once, which bounds the memory
 
 
 SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the shape factors with which quintic blends between two lines have the least peak curvature.
-
-    `angle` has the interior angles, rad. Shapes (V,) to (V,).
+    """Return the shape factors of least peak curvature of quintic blends between two lines at interior angles. Shape
+    (V,).
     """
     angles, shape_over_chord = _table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
@@ -205,10 +181,7 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return angles (rad) between two path segments, and the best shape factor of the curve that blends each corner.
-
-    The shape factors are divided by the distance between the ends of the blend, at unit distance from the corner.
-    """
+    """Return angles (rad) between two lines, and the best shape factor over the distance of the blend's ends."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -222,16 +195,12 @@ def _table() -> tuple[Array, Array]:
 
 
 def best_shape(ends: Ends, remaining: Array, samples: int = SEARCH.samples) -> Array:
-    """Return the shape factors for which quintic blends between given ends have the least peak curvature.
+    """Return the shape factors, (V,), for which quintic blends between given ends have the least peak curvature.
 
     Args:
-        ends: Point (m), unit tangent and curvature vector (1/m) at the start, and the same at the end. Shape (V, 3)
-            each.
+        ends: Point (m), unit tangent and curvature vector (1/m) at the start, and at the end. Shape (V, 3) each.
         remaining: Distance of both ends from the vertex. Shape (V,), m.
         samples: Samples of a blend for its peak curvature.
-
-    Returns:
-        Shape (V,).
     """
     blocks = [slice(first, first + SEARCH.block) for first in range(0, len(remaining), SEARCH.block)]
     shapes = [_search_shapes([each[block] for each in ends], remaining[block], samples) for block in blocks]
@@ -288,17 +257,12 @@ class Cells(NamedTuple):
     """Intervals of the curve parameter u (cells) into which polynomial curves are split to compute arc lengths.
 
     They are in the order of the curves, then of u.
-
-    Attributes:
-        curve: Index of the curve. Shape (C,).
-        start, width: Start and width of the interval of u. Shape (C,).
-        length: Arc length of the interval. Shape (C,), m.
     """
 
-    curve: NDArray[np.intp]
-    start: Array
-    width: Array
-    length: Array
+    curve: NDArray[np.intp]  # index of the curve. Shape (C,).
+    start: Array  # start of the interval of u. Shape (C,).
+    width: Array  # width of the interval of u. Shape (C,).
+    length: Array  # arc length of the interval. Shape (C,), m.
 
 
 def speed(coefficients: Array, u: Array) -> Array:
@@ -385,8 +349,7 @@ def parameter(
 ) -> tuple[NDArray[np.intp], Array]:
     """Return the curve and the curve parameter u at distances (m) from the starts of cells, intervals of u. Shape (M,).
 
-    A cubic Hermite guess from the cell's ends is refined by Chebyshev iterations, which converge cubically, with the
-    10-point rule. The result is accurate to rounding.
+    A cubic Hermite guess from the cell's ends is refined to rounding by Chebyshev iterations.
 
     Args:
         coefficients: Polynomials of the curves. Shape (B, 6, 3).
@@ -421,3 +384,95 @@ def arc_length(coefficients: Array, u: Array) -> Array:
     before = np.concatenate([[0.0], np.cumsum(parts.length)])[index]
     start = parts.start[index]
     return np.asarray(before + _lengths(_derivative(curve[np.zeros(len(index), dtype=int)]), start, u - start))
+
+
+MAX_TERMS = 100
+"""Largest allowed number of corrector steps or quadrature nodes, since a mapping's expression grows with them."""
+
+
+def derivative_of_columns(columns: Any) -> Any:
+    """Return the coefficients of a polynomial's derivative; the coefficients of each power form one column."""
+    return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
+
+
+def horner(columns: Any, u: Any) -> Any:
+    """Return the value of a polynomial whose coefficients of each power form one column, as an expression."""
+    value = columns[:, -1]
+    for j in reversed(range(columns.shape[1] - 1)):
+        value = columns[:, j] + u * value
+    return value
+
+
+def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
+    """Return the casadi Function that steps the curve parameter u along a blend by a predictor and several correctors.
+
+    Lee, Ryu, Cheong 2006: predictor (15), then `corrections` (3 in the paper) correctors (13) by the trapezoid rule
+    (12), which lets the sample drift from its distance. The degree of the blend is 3 or 5.
+
+    Returns:
+        (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). State (u_(n-1), u_n) and steps (L_n -
+            L_(n-1), L_(n+1) - L_n) give (u_n, u_(n+1)); at the first sample in a blend they are (0, 0) and (0,
+            distance from its start). Coefficients are the first rows of `Blend.coefficients`, flattened.
+    """
+    state, coefficients, steps, rate = _symbols(degree)
+    u, step = state[1], steps[1]
+    start_rate = rate(u)
+    guess = state[0] + (steps[0] + step) / start_rate  # eq. (15)
+    for _ in range(require.count("mapping: corrections", corrections, 0, MAX_TERMS)):
+        guess = u + 2 * step / (start_rate + rate(guess))
+    return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
+
+
+def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
+    """Return the casadi Function that steps the curve parameter u along a blend by quadrature and Newton steps.
+
+    The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
+    `predictor_corrector`; `nodes` is the number of quadrature nodes for each Newton step, the last of which determines
+    the drift.
+    """
+    numbers = tuple(
+        require.count("mapping: nodes", n, 1, MAX_TERMS) for n in require.each("mapping: nodes", nodes, int)
+    )
+    if not numbers:
+        raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
+    state, coefficients, steps, rate = _symbols(degree)
+    u, step = state[1], steps[1]
+    guess = state[0] + (steps[0] + step) / rate(u)  # eq. (15)
+    for number in numbers:
+        width = guess - u
+        mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
+        guess = guess - (width * mean - step) / rate(guess)
+    return ca.Function("gauss_newton", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
+
+
+def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
+    """Return the curve parameters u, (M,), of a blend at increasing distances (M,), m, from its start, step by step.
+
+    `mapping` is a result of `predictor_corrector` or `gauss_newton`, `coefficients` are those of the blend, (6, 3).
+
+    Raises:
+        ModelError: A shape is wrong, an entry is nan, or the distances do not increase from 0.
+    """
+    require.instance("march: mapping", mapping, ca.Function)
+    s = require.array("march: distances", distances, ("samples",), least=0)
+    increments = np.diff(s, prepend=0.0)
+    if (increments < 0).any():
+        wrong = float(s[int((increments < 0).argmax())])
+        raise ModelError(f"march: distances must increase from 0, not to {wrong:g} m", name="distances", value=wrong)
+    curve = require.array("blend: coefficients", coefficients, (6, 3))
+    count = len(s)
+    if not count:
+        return s
+    entries = curve.ravel()[: mapping.numel_in(1)]
+    steps = np.stack([np.concatenate([[0.0], increments[:-1]]), increments])
+    states = mapping.mapaccum(count)(np.zeros(2), np.repeat(entries[:, None], count, axis=1), steps)
+    return np.asarray(np.array(states)[1])
+
+
+def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
+    """Return symbols of state, coefficients and steps of a mapping, and the function from u to the speed |dr/du|."""
+    degree = require.choice("blend: degree", degree, (3, 5))
+    sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
+    state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
+    derivative = derivative_of_columns(ca.reshape(coefficients, 3, degree + 1))
+    return state, coefficients, steps, lambda u: ca.norm_2(horner(derivative, u))

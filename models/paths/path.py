@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models.checks import NOT_NUMBERS, ROUNDING, Array, ArrayInput, check_entries, require
+from models.checks import NOT_NUMBERS, ROUNDING, Array, ArrayInput, check_entries, require, set_fields
 from models.errors import ModelError
 from models.paths.blends import derivatives_by_arc_length
 from models.paths.segments import Line, Segment, bulb_turn, rotation_vector, screw, unit_quaternion
@@ -83,10 +83,9 @@ class Path:
 
     def __post_init__(self) -> None:
         segments = checked_segments(self.segments)
-        object.__setattr__(self, "segments", segments)
-        object.__setattr__(self, "lengths", np.array([segment.length for segment in segments]))
+        set_fields(self, segments=segments, lengths=np.array([segment.length for segment in segments]))
         for name in FRAME:
-            object.__setattr__(self, name, np.array([getattr(segment, name) for segment in segments]))
+            set_fields(self, **{name: np.array([getattr(segment, name) for segment in segments])})
         self._check_gaps()
         self._set_orientations()
         self._check_corners()
@@ -252,8 +251,7 @@ class Path:
                 whole = np.full(3, np.nan if np.any(segment.turns) else 0.0) if isinstance(segment, Spline) else None
                 turns.append(whole if whole is not None else rotation_vector(begin, current, f"segment {i}"))
                 current = current if begin @ current >= 0 else -current
-        object.__setattr__(self, "orientation", np.array(starts))
-        object.__setattr__(self, "turn", np.array(turns))
+        set_fields(self, orientation=np.array(starts), turn=np.array(turns))
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
@@ -291,39 +289,23 @@ def _angles(before: Array, after: Array) -> Array:
 
 
 class FittedPath(NamedTuple):
-    """Path in which splines and lines replace runs of short segments; see `fit_splines`.
+    """Path in which splines and lines replace runs of short segments; see `fit_splines`."""
 
-    Attributes:
-        path: The path of n segments.
-        first: Index of the first segment of the given path that each segment replaces. Shape (n,).
-        deviation: Deviation that remains for rounding each vertex. Shape (n - 1,), m.
-    """
-
-    path: Path
-    first: NDArray[np.intp]
-    deviation: Array
+    path: Path  # the path of n segments
+    first: NDArray[np.intp]  # index of the first segment of the given path that each segment replaces. Shape (n,).
+    deviation: Array  # deviation that remains for rounding each vertex. Shape (n - 1,), m.
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of the search for runs of short segments that a spline or a line can replace.
+    """Settings of the search for runs of short segments that a spline or a line can replace."""
 
-    Attributes:
-        simplified: Deviation of the simplified polyline that shows the corners, relative to the tolerance.
-        spline: Largest deviation of a spline, relative to the tolerance; the rest is for rounding the vertices.
-        sagitta: Distance of an arc from the chords that stand for it, relative to the tolerance.
-        long: Deviation, relative to the tolerance, of a line from a curve that bends in it as it does beside it; a line
-            with more stays a line.
-        straight: Deviation of the points of such a line from it, relative to the tolerance.
-        chords: Number of chords of the simplified polyline above which an arc or a helix stays as it is.
-    """
-
-    simplified: float = 0.5
-    spline: float = 0.75
-    sagitta: float = 0.05
-    long: float = 4.0
-    straight: float = 0.05
-    chords: int = 8
+    simplified: float = 0.5  # deviation of the simplified polyline that shows the corners, relative to the tolerance
+    spline: float = 0.75  # largest deviation of a spline, relative to the tolerance; the rest is for the vertices
+    sagitta: float = 0.05  # distance of an arc from the chords that stand for it, relative to the tolerance
+    long: float = 4.0  # deviation, relative to the tolerance, from a curve that bends on alike; a line with more stays
+    straight: float = 0.05  # deviation of the points of such a line from it, relative to the tolerance
+    chords: int = 8  # number of chords of the simplified polyline above which an arc or a helix stays as it is
 
 
 RUNS = RunSettings()
@@ -378,10 +360,7 @@ def fit_splines(
 
 
 def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
-    """Return a path as a polyline, within `sagitta` of its arcs, and the index of the polyline's point at each vertex.
-
-    The quaternions are None if the path states no tool orientation.
-    """
+    """Return a path as a polyline, within `sagitta` of its arcs, and the index of the point at each vertex."""
     with np.errstate(divide="ignore"):
         chord = np.where(path.is_spline, np.inf, np.sqrt(8 * sagitta / path.curvature))
     counts = np.maximum(np.ceil(path.lengths / chord), 1).astype(int)
@@ -399,8 +378,8 @@ def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: fl
     """Return whether a run of short segments, which a spline may replace, ends at each vertex of a path. Shape (n +
     1,).
 
-    A simplified polyline shows the shape of the path without its noise. A curve that is within its deviation from the
-    chord c bends by 8 deviation / c from chord to chord; where the path bends much more, it has a corner.
+    A curve that is within its deviation from the chord c of a simplified polyline bends by 8 deviation / c from chord
+    to chord; where the path bends much more, it has a corner.
     """
     corners = simplify_polyline(points, RUNS.simplified * tolerance)
     steps = np.diff(points[corners], axis=0)

@@ -36,46 +36,28 @@ Overlap: TypeAlias = Literal["shrink", "refuse"]
 
 @dataclass(frozen=True)
 class RoundingSettings:
-    """Settings of the algorithms that round the corners of a path.
+    """Settings of the algorithms that round the corners of a path."""
 
-    Attributes:
-        samples: Samples of a blend for its deviation, of the neighbourhood of the maximum, and of one turn of a helix
-            for its closest point.
-        reserve: Fraction of the tolerance reserved for deviations between the samples.
-        iterations: Largest number of remaining distances tried, and of rounds that shrink overlapping blends.
-        newton_iterations: Newton iterations to the closest point of a helix or spline.
-        least_slope: Slope of the condition of the closest point below which a step is damped: near the helix axis.
-        block: Corners processed at once, which bounds the memory.
-        shortest: Length, relative to its segment, below which the rest between two blends is a rounding error and
-            dropped.
-        named: Largest number of vertices named in a warning.
-    """
-
-    samples: int = 33
-    reserve: float = 1e-3
-    iterations: int = 60
-    newton_iterations: int = 4
-    least_slope: float = 0.1
-    block: int = 500
-    shortest: float = 1e-12
-    named: int = 12
+    samples: int = 33  # samples of a blend, of the neighbourhood of its maximum, and of one turn of a helix
+    reserve: float = 1e-3  # fraction of the tolerance reserved for deviations between the samples
+    iterations: int = 60  # largest number of remaining distances tried, and of rounds that shrink overlapping blends
+    newton_iterations: int = 4  # Newton iterations to the closest point of a helix or spline
+    least_slope: float = 0.1  # slope of the condition of the closest point below which a step is damped
+    block: int = 500  # corners processed at once, which bounds the memory
+    shortest: float = 1e-12  # relative length below which the rest between two blends is a rounding error
+    named: int = 12  # largest number of vertices named in a warning
 
 
 SETTINGS = RoundingSettings()
 
 
 class _Corners(NamedTuple):
-    """Vertices of a path, and the kind and shape factors of the blends that round them.
-
-    Attributes:
-        shape: Shape factors. Shape (V,).
-        vertices: Indices of the vertices; 0 is the end of the first segment. Shape (V,).
-    """
+    """Vertices of a path, and the kind and shape factors of the blends that round them."""
 
     path: Path
     kind: BlendKind
-    shape: Array
-    vertices: NDArray[np.intp]
+    shape: Array  # shape factors. Shape (V,).
+    vertices: NDArray[np.intp]  # indices of the vertices; 0 is the end of the first segment. Shape (V,).
 
     def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
         """Return the corners with the given indices."""
@@ -113,9 +95,10 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners of a path, and the distance from each vertex to both ends of its blend. Shape (n - 1,), m.
+    """Return the corners, with the best shape factors if `free`, and the distance from each vertex to its blend's ends,
+    m.
 
-    The corners have the best shape factors if `free`. Other arguments as for `smooth`.
+    Other arguments as for `smooth`.
     """
     require.choice("path: overlap", overlap, get_args(Overlap))
     if (remaining is None) == (deviation is None):
@@ -238,7 +221,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
     """Return the distance of each vertex from its blend, and the largest distance of the blend from its two segments.
 
     Together they bound the deviation between smooth path and task in both directions. They are sampled uniformly and
-    again about the maximum. The first is never below the true value, the second by at most 0.1 %. Shape (V,), m.
+    again about the maximum; the second is below the true value by at most 0.1 %. Shape (V,), m.
     """
     path, vertices, curves = corners.path, corners.vertices, corners.blends(remaining)
     u = np.linspace(0, 1, SETTINGS.samples)
@@ -293,10 +276,7 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points, shape (V, S, 3), from V parts of path segments. Shape (V, S), m.
-
-    Each part, for one row of points, extends from the distance `first` to the distance `last` along its segment.
-    """
+    """Return the distances (V, S), m, of points (V, S, 3) from V parts of segments, from `first` to `last`, m."""
     spatial = (path.torsion[index] != 0) | path.is_spline[index]
     if spatial.any():
         result = np.empty(points.shape[:2])
@@ -323,10 +303,7 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
 
 def _distance_to_curve(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points from parts of helices or splines, by Newton's method from the closest sample.
-
-    Arguments and shapes are those of `_distance_to_segment`.
-    """
+    """Return the distances of points from parts of helices or splines, by Newton's method from the closest sample."""
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_curve(path, index[p], points[p], first[p], last[p]) for p in parts])

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from models.checks import Array, ArrayInput, freeze, require
+from models.checks import Array, ArrayInput, freeze, require, set_fields
 from models.errors import ModelError
 from models.paths.splines import Spline
 from models.spatial import FULL_TURN
@@ -50,7 +50,7 @@ class Line:
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):
-            object.__setattr__(self, name, require.array(f"line: {name}", getattr(self, name), (3,)))
+            set_fields(self, **{name: require.array(f"line: {name}", getattr(self, name), (3,))})
         _set_orientations(self, "line")
         if self.length <= SHORTEST_SEGMENT:
             message = (
@@ -76,10 +76,13 @@ class Line:
 
 
 class _Circular:
-    """Radius, start normal and end point, which arcs and helices compute in the same way."""
+    """Geometry of a helix with start, center, axis, sweep and rise; an arc has no rise."""
 
     start: ArrayInput
     center: ArrayInput
+    axis: ArrayInput
+    sweep: float
+    rise: float
 
     @property
     def radius(self) -> float:
@@ -92,7 +95,28 @@ class _Circular:
         return np.asarray((self.center - self.start) / self.radius)
 
     @property
-    def end(self: Any) -> Array:
+    def length(self) -> float:
+        """Arc length, m."""
+        return float(np.hypot(self.radius * self.sweep, self.rise))
+
+    @property
+    def tangent(self) -> Array:
+        """Unit tangent at the start. Shape (3,)."""
+        tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
+        return np.asarray((tangential + self.rise * self.axis) / self.length)
+
+    @property
+    def curvature(self) -> float:
+        """Curvature, 1/m."""
+        return self.radius * (self.sweep / self.length) ** 2
+
+    @property
+    def torsion(self) -> float:
+        """Torsion, 1/m; positive for a right-handed helix, zero for an arc."""
+        return self.rise * self.sweep / self.length**2
+
+    @property
+    def end(self) -> Array:
         """End point of the arc or helix in the world. Shape (3,), m."""
         frame = self.start, self.tangent, self.normal
         return np.asarray(screw(*frame, curvature=self.curvature, torsion=self.torsion, distance=self.length)[0])
@@ -108,7 +132,7 @@ class Arc(_Circular):
         axis: Unit vector about which the arc turns, right-handed. Shape (3,).
         sweep: Angle of rotation, rad, in (0, 2 pi].
         start_orientation, end_orientation: As for a Line.
-        torsion: Zero, 1/m.
+        rise: Zero, m.
 
     Raises:
         ModelError: An entry is not finite, the radius is zero, the axis is zero or not perpendicular to the radius, or
@@ -121,7 +145,7 @@ class Arc(_Circular):
     sweep: float
     start_orientation: ArrayInput | None = None
     end_orientation: ArrayInput | None = None
-    torsion: ClassVar[float] = 0.0
+    rise: ClassVar[float] = 0.0  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         radius = _set_circle(self, "arc")
@@ -132,7 +156,7 @@ class Arc(_Circular):
                 "reverse the axis for the other sense, use a Helix for several turns"
             )
             raise ModelError(message, name="sweep", value=sweep, limit=(0.0, FULL_TURN))
-        object.__setattr__(self, "sweep", sweep)
+        set_fields(self, sweep=sweep)
         _set_orientations(self, "arc")
 
     @classmethod
@@ -183,21 +207,6 @@ class Arc(_Circular):
         sweep = 2 * float(np.arctan2(chord / 2, height))
         return cls(a, center, axis, sweep, start_orientation, end_orientation)
 
-    @property
-    def length(self) -> float:
-        """Length of the arc, m."""
-        return self.radius * self.sweep
-
-    @property
-    def tangent(self) -> Array:
-        """Unit tangent of the arc at its start. Shape (3,)."""
-        return np.cross(self.normal, self.axis)
-
-    @property
-    def curvature(self) -> float:
-        """Curvature of the arc, 1/m."""
-        return 1 / self.radius
-
 
 @dataclass(frozen=True, eq=False)
 class Helix(_Circular):
@@ -227,33 +236,11 @@ class Helix(_Circular):
     def __post_init__(self) -> None:
         radius = _set_circle(self, "helix")
         sweep = require.positive("helix: sweep", self.sweep, unit="rad")
-        object.__setattr__(self, "sweep", sweep)
-        object.__setattr__(self, "rise", require.number("helix: rise", self.rise))
+        set_fields(self, sweep=sweep, rise=require.number("helix: rise", self.rise))
         if self.length <= SHORTEST_SEGMENT:
             message = f"helix: sweep {sweep:g} rad at radius {radius:g} m has the length {self.length:g} m; remove it"
             raise ModelError(message, name="sweep", value=sweep, limit=SHORTEST_SEGMENT)
         _set_orientations(self, "helix")
-
-    @property
-    def length(self) -> float:
-        """Arc length of the helix, m."""
-        return float(np.hypot(self.radius * self.sweep, self.rise))
-
-    @property
-    def tangent(self) -> Array:
-        """Unit tangent of the helix at its start. Shape (3,)."""
-        tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
-        return np.asarray((tangential + self.rise * self.axis) / self.length)
-
-    @property
-    def curvature(self) -> float:
-        """Curvature of the helix, 1/m."""
-        return self.radius * (self.sweep / self.length) ** 2
-
-    @property
-    def torsion(self) -> float:
-        """Torsion of the helix, 1/m; positive for a right-handed helix."""
-        return self.rise * self.sweep / self.length**2
 
 
 Segment: TypeAlias = Line | Arc | Helix | Spline
@@ -292,10 +279,10 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the direction vectors and the rotation rate of the screw motion along a line, arc or helix.
+    """Return axial and tangential part of the tangent, vector towards the screw axis, (..., 3) each, and rotation rate,
+    rad/m.
 
-    The axial and tangential components of the tangent and the vector towards the screw axis, shape (..., 3) each; the
-    rotation rate, shape (...), rad/m. Arguments as for `screw`.
+    Arguments as for `screw`.
     """
     k, w = np.asarray(curvature, dtype=float), np.asarray(torsion, dtype=float)
     if not np.any(w):
@@ -311,12 +298,12 @@ def screw_axes(
 def _set_circle(segment: Any, owner: str) -> float:
     """Check and set start, center and axis of an arc or a helix; return the radius, m."""
     for name in ("start", "center", "axis"):
-        object.__setattr__(segment, name, require.array(f"{owner}: {name}", getattr(segment, name), (3,)))
+        set_fields(segment, **{name: require.array(f"{owner}: {name}", getattr(segment, name), (3,))})
     norm = float(np.linalg.norm(segment.axis))
     if norm == 0:
         message = f"{owner}: axis [0, 0, 0] has no direction; give the axis of rotation"
         raise ModelError(message, name="axis", value=segment.axis)
-    object.__setattr__(segment, "axis", segment.axis / norm)
+    set_fields(segment, axis=segment.axis / norm)
     radius = float(np.linalg.norm(segment.start - segment.center))
     if radius <= SHORTEST_SEGMENT:
         message = f"{owner}: start {segment.start.tolist()} coincides with the center; the radius {radius:g} m is zero"
@@ -335,7 +322,7 @@ def _set_circle(segment: Any, owner: str) -> float:
 def _set_orientations(segment: Segment, owner: str) -> None:
     for name in ("start_orientation", "end_orientation"):
         if getattr(segment, name) is not None:
-            object.__setattr__(segment, name, unit_quaternion(getattr(segment, name), f"{owner}: {name}"))
+            set_fields(segment, **{name: unit_quaternion(getattr(segment, name), f"{owner}: {name}")})
     if segment.start_orientation is not None and segment.end_orientation is not None:
         rotation_vector(segment.start_orientation, segment.end_orientation, owner)  # refuses half turns
 
@@ -376,10 +363,7 @@ def unit_quaternion(value: ArrayInput, what: str) -> Array:
 
 
 def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
-    """Return the vector of the shorter rotation from one orientation to another, in the axes of the first. Shape (3,),
-    rad.
-
-    second = first exp(vector).
+    """Return the vector of the shorter rotation between orientations, second = first exp(vector). Shape (3,), rad.
 
     Raises:
         ModelError: The orientations differ by nearly half a turn, so the shorter rotation is ambiguous.

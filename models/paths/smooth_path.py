@@ -1,4 +1,4 @@
-"""Paths with rounded corners as functions of the distance along the path.
+"""Paths with rounded corners as functions of the distance along the path, in numpy and as casadi Functions.
 
 On each piece of a path, a blend or what remains of a segment, the tool orientation is q(s) = reference exp(theta(s)),
 where the rotation vector theta is a polynomial of the distance s. For a segment that turns at a constant rate about a
@@ -10,17 +10,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from math import factorial
+from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
-from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_length, parameter, quintic
+from models.paths.blends import (
+    GAUSS_NODES,
+    GAUSS_WEIGHTS,
+    BlendKind,
+    Cells,
+    curvature,
+    derivative_of_columns,
+    derivatives_by_arc_length,
+    horner,
+    parameter,
+    quintic,
+    speed,
+)
 from models.paths.path import Path
-from models.paths.splines import Spline, along_piece, chart
+from models.paths.segments import screw_axes
+from models.paths.splines import SERIES_TERMS, Spline, along_piece, chart
+from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
 BLOCK_SIZE = 50_000
 """Number of samples processed at once; it bounds the memory use."""
@@ -151,15 +167,10 @@ class SmoothPath:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
             raise ModelError(message, name="vertex", value=vertex, limit=count)
         piece = int(np.flatnonzero(self.piece_blend == vertex)[0])
-        return Blend(
-            self.path.start[vertex + 1],
-            float(self.path.corner_angles()[vertex]),
-            float(self.remaining[vertex]),
-            float(self.shape[vertex]),
-            float(self.bounds[piece]),
-            float(self.bounds[piece + 1]),
-            self.coefficients[self.piece_curve[piece]],
-        )
+        sizes = self.path.corner_angles()[vertex], self.remaining[vertex], self.shape[vertex]
+        angle, remaining, shape, begin, end = map(float, (*sizes, *self.bounds[piece : piece + 2]))
+        curve = self.coefficients[self.piece_curve[piece]]
+        return Blend(self.path.start[vertex + 1], angle, remaining, shape, begin, end, curve)
 
     def at(self, distance: ArrayInput) -> PathPoint:
         """Return position, tangent, curvature and curvature rate at distances from the start, shape (M,), m.
@@ -185,10 +196,7 @@ class SmoothPath:
         return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """Return the curve parameter u of the blend or piece of a spline at each distance from the start. Shape (M,).
-
-        It is nan on lines, arcs and helices.
-        """
+        """Return the curve parameter u at each distance from the start, nan on lines, arcs and helices. Shape (M,)."""
         s = self.checked_distance(distance)
         u, curved = np.full(len(s), np.nan), self.piece_curve[self._piece(s)] >= 0
         u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
@@ -213,7 +221,7 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed on every segment and blend, given the speeds on the segments. Shape (P,).
+        """Return the speed, (P,), on every segment and blend, given the speeds on the segments.
 
         A blend has the lower speed of its two neighbours.
 
@@ -292,10 +300,10 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Tool orientation on each segment and blend: reference quaternions, and polynomials of the rotation vector
-        from them.
+        """Tool orientation on each segment and blend: reference quaternions, (P, 4), and rotation vectors from them,
+        (P, 6, 3).
 
-        Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
+        The latter are polynomials of distance / length.
         """
         path, lengths = self.path, self.piece_lengths
         start_offset = np.concatenate([[0.0], self.remaining])
@@ -330,3 +338,156 @@ def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths:
         for result, values in zip(results, function(s[part]), strict=True):
             result[part] = values
     return results
+
+
+def path_function(path: SmoothPath) -> Any:
+    """Return the casadi Function that evaluates position, tangent and curvature of a path at a distance (m) along it.
+
+    Outputs: position (3, m), tangent (3), curvature vector (3, 1/m), its derivative (3, 1/m^2). It is an MX function
+    with the tables of the path in it, which computes the same as `SmoothPath.at`; distances outside the path are
+    clamped to it. casadi differentiates inside a cell only.
+    """
+    knots, columns = _cell_table(require.instance("path_function: path", path, SmoothPath))
+    s = ca.MX.sym("distance")
+    clamped = _clamp(s, path.length)
+    outputs = _cell_function()(_column_at(knots, columns, clamped), clamped)
+    return ca.Function("path", [s], list(outputs), ["distance"], ["position", "tangent", "curvature", "curvature_rate"])
+
+
+def turn_function(path: SmoothPath) -> Any:
+    """Return the casadi Function that evaluates tool orientation and its rates at a distance (m) along a path.
+
+    Outputs as `SmoothPath.turn`: quaternion (4), rate, acceleration, jerk (3 each, rad/m, rad/m^2, rad/m^3).
+    """
+    reference, theta = require.instance("turn_function: path", path, SmoothPath).charts
+    columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
+    s = ca.MX.sym("distance")
+    clamped = _clamp(s, path.length)
+    column = _column_at(path.bounds, columns, clamped)
+    outputs = orientation_function()(column[:4], column[4:22], column[22], (clamped - column[23]) / column[22])
+    return ca.Function("turn", [s], list(outputs), ["distance"], ["quaternion", "rate", "acceleration", "jerk"])
+
+
+def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
+    """Return the column of a table for the interval between knots in which a distance lies (binary search).
+
+    The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
+    """
+    count = len(knots) - 1
+    if count == 1:
+        return ca.MX(ca.DM(columns))
+    place = ca.interpolant("place", "linear", [knots], np.arange(count + 1.0), {"lookup_mode": ["binary"]})
+    table = ca.interpolant("table", "linear", [np.arange(count)], columns.ravel("F"), {"lookup_mode": ["exact"]})
+    return table(ca.fmin(ca.floor(place(distance)), count - 1))
+
+
+def _clamp(distance: Any, length: float) -> Any:
+    """Return the distance clamped to the path, as an expression whose derivative stays 1 at both ends of the path."""
+    return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
+
+
+@lru_cache(maxsize=1)
+def _cell_function() -> Any:
+    row, s = ca.SX.sym("row", 38), ca.SX.sym("s")
+    start, axial, tangential, inward, rate, powers, cell = ca.vertsplit(row, [0, 3, 6, 9, 12, 13, 31, 38])
+    coefficients = ca.reshape(powers, 3, 6)
+    first_s, length, curved, first_u, width, speed0, speed1 = ca.vertsplit(cell)
+    distance = s - first_s
+
+    # on a segment; a line has the rate 0, where sin(rate s)/rate is s
+    safe = rate + (rate == 0)
+    along = ca.if_else(rate == 0, distance, ca.sin(rate * distance) / safe)
+    across = ca.if_else(rate == 0, 0, 2 * ca.sin(rate * distance / 2) ** 2 / safe)
+    cosine, sine = ca.cos(rate * distance), ca.sin(rate * distance)
+    turning = cosine * tangential + sine * inward
+    on_segment = [
+        start + distance * axial + along * tangential + across * inward,
+        axial + turning,
+        rate * (cosine * inward - sine * tangential),
+        -(rate**2) * turning,
+    ]
+
+    u = ca.SX.sym("u")
+    slopes = derivative_of_columns(coefficients)
+    bends = derivative_of_columns(slopes)
+    first, second, third = (horner(columns, u) for columns in (slopes, bends, derivative_of_columns(bends)))
+    rate = ca.norm_2(first)
+    rate_of = ca.Function("rate", [row, u], [rate])
+    x = distance / length
+    slope0, slope1 = length / (width * speed0), length / (width * speed1)
+    guess: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
+    for _ in range(3):  # the interpolation is already close
+        step = guess - first_u
+        mean = sum(
+            float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
+        )
+        guess = guess - (step * mean - distance) / rate_of(row, guess)
+    rate_u = ca.dot(first, second) / rate
+    rate_uu = (ca.dot(second, second) + ca.dot(first, third) - rate_u**2) / rate
+    bend = (second - first * rate_u / rate) / rate**2
+    change = (third - 3 * second * rate_u / rate + first * (3 * rate_u**2 / rate**2 - rate_uu / rate)) / rate**3
+    curve = ca.Function("curve", [row, u], [horner(coefficients, u), first / rate, bend, change])
+    outputs = [ca.if_else(curved, b, a) for a, b in zip(on_segment, curve(row, guess), strict=True)]
+    return ca.Function("in_cell", [row, s], ca.cse(outputs))
+
+
+def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
+    """Return the distances at which parts of the path start, then its length, and a data column for each part.
+
+    A part is what remains of a line, arc or helix, or a cell of a curve. A segment has its start point, the axial,
+    tangential and inward vectors of its screw, and its rotation rate; a curve its coefficients. Both have distance,
+    length, whether it is a curve, u at the start, width in u, speeds at both ends.
+    """
+    on_segment = np.flatnonzero(path.piece_curve < 0)
+    count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
+    skipped = np.concatenate([[0.0], path.remaining])[segment]
+    position, tangent, bend, _ = task.at(segment, skipped)
+    k = task.curvature[segment]
+    normal = bend / np.where(k == 0, 1.0, k)[:, None]
+    screw = screw_axes(tangent, normal, k, task.torsion[segment])
+    # a segment needs some regular curve, of nonzero speed, which is not used
+    unused = np.tile([0, 0, 0, 1, 0, 0] + [0] * 12, (count, 1))
+    begin, length, none, one = path.bounds[on_segment], path.piece_lengths[on_segment], np.zeros(count), np.ones(count)
+    segments = np.column_stack([position, *screw, unused, begin, length, none, none, one, length, length])
+
+    coefficients = path.coefficients[cells.curve]
+    speeds = speed(coefficients, cells.start), speed(coefficients, cells.start + cells.width)
+    flag, unused, begin_cells = np.ones(len(cells.curve)), np.zeros((len(cells.curve), 13)), path.cell_bounds
+    shape = coefficients.reshape(-1, 18)
+    curves = np.column_stack([unused, shape, begin_cells, cells.length, flag, cells.start, cells.width, *speeds])
+    starts = np.concatenate([begin, begin_cells])
+    order = np.argsort(starts, kind="stable")
+    return np.append(starts[order], path.length), np.concatenate([segments, curves])[order].T
+
+
+def exponential(vector: Any) -> Any:
+    """Return the unit quaternion of a rotation vector (rad), up to 2 pi, as a casadi expression. Shape (4, 1).
+
+    A power series in the squared angle, smooth at zero.
+    """
+    square = ca.dot(vector, vector) / 4
+    cosine: Any = 0
+    sinc: Any = 0
+    for k in reversed(range(SERIES_TERMS)):
+        cosine = (-1) ** k / factorial(2 * k) + square * cosine
+        sinc = (-1) ** k / factorial(2 * k + 1) + square * sinc
+    return ca.vertcat(cosine, sinc / 2 * vector)
+
+
+@lru_cache(maxsize=1)
+def orientation_function() -> Any:
+    """Return the casadi Function that evaluates the tool orientation and its rates on one segment or blend of a path.
+
+    Inputs: reference (4); theta (3, 6) as 18 entries column by column; length (m); distance over length. Outputs as
+    `turn_function`.
+    """
+    reference, theta = ca.SX.sym("reference", 4), ca.SX.sym("theta", 18)
+    length, fraction = ca.SX.sym("length"), ca.SX.sym("fraction")
+    powers = ca.vertcat(*[fraction**k for k in range(6)])
+    quaternion = quaternion_product(reference, exponential(ca.mtimes(ca.reshape(theta, 3, 6), powers)))
+    outputs = [quaternion]
+    rate = angular_velocity_from_quaternion(quaternion, ca.jacobian(quaternion, fraction) / length)
+    for _ in range(3):
+        outputs.append(rate)
+        rate = ca.jacobian(rate, fraction) / length
+    return ca.Function("orientation", [reference, theta, length, fraction], ca.cse(outputs))

@@ -1,15 +1,11 @@
 """Splines in place of many short segments of a path: the segment, its tool orientation, and its fit to a polyline.
 
-A least-squares B-spline of degree 5, whose first four derivatives are continuous, is fitted to a polyline by its arc
-length. Wherever the spline deviates too much, the interval between two knots is halved. The number of its pieces
-therefore depends on the shape of the polyline and not on the number of its points.
+A least-squares B-spline of degree 5 is fitted to a polyline by its arc length, and intervals between knots are halved
+where it deviates too much. Both curves have the same parameter. Between two points of the union of knots and corners,
+their difference is a polynomial, and the largest norm of its Bernstein coefficients bounds it. So the bound holds for
+the distance of all points of either curve from the other one.
 
-Both curves have the same parameter. Between two points of the union of knots and corners, their difference is a
-polynomial, and the largest norm of its Bernstein coefficients bounds it. So the bound holds for the distance of all
-points of either curve from the other one, not for samples alone.
-
-On each piece the tool orientation is q(s) = reference exp(theta(s)), where the rotation vector theta is a polynomial of
-the distance s.
+On each piece the tool orientation is q(s) = reference exp(theta(s)), with a polynomial theta of the distance s.
 """
 
 from __future__ import annotations
@@ -24,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.checks import ROUNDING, Array, ArrayInput, require
+from models.checks import ROUNDING, Array, ArrayInput, require, set_fields
 from models.errors import ModelError
 from models.paths.blends import (
     GAUSS_NODES,
@@ -65,10 +61,10 @@ class Spline:
 
     def __post_init__(self) -> None:
         curves = require.array("spline: coefficients", self.coefficients, ("pieces", 6, 3), least=1)
-        object.__setattr__(self, "coefficients", curves)
+        set_fields(self, coefficients=curves)
         for name, shape in (("references", (len(curves), 4)), ("turns", (len(curves), 6, 3))):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, require.array(f"spline: {name}", getattr(self, name), shape))
+                set_fields(self, **{name: require.array(f"spline: {name}", getattr(self, name), shape)})
         gaps = np.linalg.norm(curves[:-1].sum(axis=1) - curves[1:, 0], axis=1)
         if gaps.max(initial=0.0) > ROUNDING:
             i = int(gaps.argmax())
@@ -167,21 +163,13 @@ class Spline:
 
 
 class SplineTable(NamedTuple):
-    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once.
+    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once."""
 
-    Attributes:
-        curves: Polynomial that each cell is a part of. Shape (C, 6, 3), m.
-        cells: The cells, each with a curve of its own.
-        cell_begins: Distance along the path at which each cell begins. Shape (C,), m.
-        first: First cell of each segment of the path, and finally C. Shape (n + 1,).
-        begins: Distance along the path at which each segment begins. Shape (n,), m.
-    """
-
-    curves: Array
-    cells: Cells
-    cell_begins: Array
-    first: NDArray[np.intp]
-    begins: Array
+    curves: Array  # polynomial that each cell is a part of. Shape (C, 6, 3), m.
+    cells: Cells  # the cells, each with a curve of its own
+    cell_begins: Array  # distance along the path at which each cell begins. Shape (C,), m.
+    first: NDArray[np.intp]  # first cell of each segment of the path, and finally C. Shape (n + 1,).
+    begins: Array  # distance along the path at which each segment begins. Shape (n,), m.
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
@@ -204,9 +192,7 @@ class SplineTable(NamedTuple):
 
 
 def _between(coefficients: Array, first: Array, last: Array) -> Array:
-    """Return polynomial curves with a new parameter, whose range 0 to 1 is the part from `first` to `last`. Shape (P,
-    6, 3).
-    """
+    """Return polynomial curves reparametrised so that 0 to 1 is the part from `first` to `last`. Shape (P, 6, 3)."""
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
     matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
@@ -214,44 +200,31 @@ def _between(coefficients: Array, first: Array, last: Array) -> Array:
 
 
 class Polyline(NamedTuple):
-    """Points to fit a spline to, and the tool orientation at the points.
+    """Points to fit a spline to, and the tool orientation at the points."""
 
-    Attributes:
-        points: Shape (N, 3), m; two successive points differ.
-        quaternions: Unit quaternions with continuous signs; between two points the tool turns about a fixed axis, in
-            proportion to the distance. Shape (N, 4). None: the tool does not turn.
-    """
-
-    points: Array
-    quaternions: Array | None = None
+    points: Array  # shape (N, 3), m; two successive points differ
+    quaternions: Array | None = None  # unit, with continuous signs, (N, 4); None: the tool does not turn
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of the fit of a spline to a polyline.
+    """Settings of the fit of a spline to a polyline."""
 
-    Attributes:
-        degree: Degree of the spline; the pieces are quintic polynomials.
-        samples: Least number of samples of the polyline between two knots: twice as many as one knot adds unknowns,
-            for each side of it.
-        end_weight: Weight of both ends, which are then met exactly.
-    """
-
-    degree: int = 5
-    samples: int = 12
-    end_weight: float = 1e3
+    degree: int = 5  # degree of the spline; the pieces are quintic polynomials
+    samples: int = 12  # least samples of the polyline between two knots: twice as many as a knot adds unknowns
+    end_weight: float = 1e3  # weight of both ends, which are then met exactly
 
 
 FIT = FitSettings()
 
 
 def fit_spline(line: Polyline, deviation: float, angle: float, max_pieces: int) -> tuple[Spline, float] | None:
-    """Fit a spline to a polyline, whose ends it meets; return it with a bound of its deviation, m.
+    """Fit a spline to a polyline, whose ends it meets; return it with a bound of its deviation, m, or None.
 
     Args:
-        deviation: Largest distance (m) between points of equal parameter of polyline and spline. It bounds the distance
-            of each point of either curve from the other curve.
-        angle: Largest angle (rad) between the tool orientations there, checked at the points, at the knots and midway.
+        deviation: Largest distance (m) between points of equal parameter of polyline and spline.
+        angle: Largest angle (rad) between the tool orientations there, checked at the points, at the knots and
+            midway.
         max_pieces: Largest number of pieces; None is returned if more are needed.
     """
     points, quaternions = line
@@ -391,9 +364,8 @@ def rotate(quaternion: Array, vector: Array) -> Array:
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
     """Return the tool orientation and its rates at M samples on segments and blends of a path.
 
-    It is computed in numpy as `orientation_function` does in casadi. omega = theta' + B theta x theta' + C theta x
-    (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and a = |theta|, in the axes of the reference. B and
-    C are entire functions of a^2.
+    omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and a
+    = |theta|, in the axes of the reference. B and C are entire functions of a^2.
 
     Args:
         reference: Shape (M, 4).
@@ -428,10 +400,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return value and first two derivatives of a power series, sum over k of (-x)^k / (2 k + start)!, at x = `square`.
-
-    The sum of (-x)^k / (2 k + start)! over k at x = `square`; derivatives are with respect to x.
-    """
+    """Return sum over k of (-x)^k / (2 k + start)! and its first two derivatives at x = `square`."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first

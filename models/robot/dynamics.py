@@ -5,8 +5,7 @@ numbers. The base is at rest unless its motion is given; moments are about point
 raise ModelError for wrong sizes and for a wrench on an unknown link.
 
 Inverse dynamics is the recursive Newton-Euler algorithm (Luh, Walker, Paul 1980; Featherstone 2008, chapter 5) in link
-axes, where the inertias are constant: less than half the operations of world axes, and a quarter for derivatives. Its
-arguments are of one kind: wrenches with SX entries need SX positions.
+axes. Its arguments are of one kind: wrenches with SX entries need SX positions.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.checks import require
+from models.checks import require, set_fields
 from models.robot.kinematics import (
     Placement,
     checked_placement,
@@ -68,7 +67,7 @@ class Wrench:
             value = checked_vector(f"{owner}: {part}", getattr(self, part), 3, "x, y and z")
             if isinstance(value, ca.DM):
                 require.array(f"{owner}: {part}", np.array(value).ravel(), (3,))
-            object.__setattr__(self, part, value)
+            set_fields(self, **{part: value})
 
 
 def inverse_dynamics(
@@ -173,9 +172,7 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the twist of a moving base and its time derivative, or (None, None) for a base at rest; raise ModelError
-    for a base motion that is neither None nor such a pair.
-    """
+    """Return the twist of a moving base and its time derivative, (None, None) for a base at rest."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -200,8 +197,7 @@ def _efforts(
 
     A point x of a link accelerates by a + U x, with U = [alpha x] + [omega x]^2 of the link and a of its origin, less
     gravity. So the link needs the force m a + U h and the moment cross(h, a) + sum of m cross(x, U x). The entries of
-    that sum are twice those of the antisymmetric part of U J; h and J are the sums of m x and of m x x' (Atkeson, An,
-    Hollerbach 1986 write the same with the inertia).
+    that sum are twice those of the antisymmetric part of U J; h and J are the sums of m x and of m x x'.
     """
     ground = checked_placement(world_from_base)
     frames = link_frames(robot, q, world_from_base) if links else {}
@@ -247,11 +243,7 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return, by link name, the acceleration of the link's origin less gravity, and the matrix from the position of a
-    point in the link to its acceleration relative to that of the origin.
-
-    Shapes (3, 1) and (3, 3), in the axes of the link; `_field` explains the field.
-    """
+    """Return each link's acceleration of the origin less gravity, (3, 1), and `_field`, in link axes."""
     rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -283,26 +275,19 @@ def _motions_in_links(
 
 
 def _field(spin: Expression, turning: Expression) -> Expression:
-    """Return the matrix from a point of a rotating body to its acceleration relative to the body's origin.
-
-    [alpha x] + [omega x]^2 with the angular velocity omega, `spin`, and acceleration alpha, `turning`. Shape (3, 3).
+    """Return the matrix [alpha x] + [omega x]^2 from a point of a body to its acceleration relative to the body's
+    origin.
     """
     squares = ca.mtimes(spin, spin.T)
     return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)
 
 
 class MassMoments(NamedTuple):
-    """Mass and first and second mass moments of a set of bodies about the world's origin.
+    """Mass and first and second mass moments of a set of bodies about the world's origin."""
 
-    Attributes:
-        mass: kg.
-        first: Sum of mass times centre of mass. Shape (3, 1), kg m.
-        second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
-    """
-
-    mass: float
-    first: Expression
-    second: Expression
+    mass: float  # kg
+    first: Expression  # sum of mass times centre of mass. Shape (3, 1), kg m.
+    second: Expression  # rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
 
     def plus(self, other: MassMoments) -> MassMoments:
         """Return the mass moments of the union of two disjoint sets of bodies."""
@@ -328,10 +313,7 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the matrix from joint rates to (angular momentum about the world's origin, linear momentum).
-
-    The base is at rest. Shape (6, dof).
-    """
+    """Return the matrix, (6, dof), from joint rates to (angular momentum about the world's origin, linear momentum)."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     moments = subtree_moments(robot, frames)
     return ca.densify(joint_momenta(robot, axes, moments))
@@ -361,9 +343,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the matrix from joint rates to momentum, given joint axes (of frames_and_axes) and mass moments (of
-    subtree_moments). Shape (6, dof).
-    """
+    """Return the matrix from joint rates to momentum, (6, dof), from results of frames_and_axes and subtree_moments."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *reduce_to_joint_vector(robot, momenta))

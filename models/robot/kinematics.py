@@ -1,11 +1,11 @@
 """Kinematics of robots: frames, Jacobians, motion of links and centre of mass, performance indices.
 
 Joint positions q, velocities qd and accelerations qdd have shape (dof, 1) in the order of `robot.joint_names`, as SX,
-MX, DM or numbers; mimic joints move as coupled. `world_from_base` = (rotation, position) is the pose of the root
-link in the world, the identity if None. The base is at rest.
+MX, DM or numbers. `world_from_base` = (rotation, position) is the pose of the root link in the world, the identity if
+None. The base is at rest. All functions raise ModelError for vectors of a wrong size and unknown links, and for a
+massless robot if they divide by its mass.
 
-Everything is written in world axes, so that what a planar machine cannot do stays a structural zero. All functions
-raise ModelError for vectors of a wrong size and unknown links, and for a massless robot if they divide by its mass.
+Everything is written in world axes, so that what a planar machine cannot do stays a structural zero.
 """
 
 from __future__ import annotations
@@ -40,14 +40,9 @@ def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
 
 
 def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Expression:
-    """Return a vector as a CasADi column after checking that it has `size` entries.
+    """Return a vector as a CasADi column; raise ModelError unless it is numeric, finite and has `size` entries.
 
-    Args:
-        label: As in `models.checks.Checks`.
-        meaning: Meaning of the entries, for messages.
-
-    Raises:
-        ModelError: Another size, or a value that is not numeric or not finite.
+    `label` is as in `models.checks.Checks`; `meaning`, of the entries, is for messages.
     """
     name, limit = argument_of(label), (size, 1)
     try:
@@ -104,6 +99,14 @@ def reduce_to_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> 
     return entries
 
 
+def coupling_matrix(robot: Robot) -> ca.DM:
+    """Return the matrix from rates of the joint vector to those of all moving joints. Shape (moving joints, dof)."""
+    rows = np.zeros((len(robot.couplings), robot.dof))
+    for row, (column, ratio, _) in zip(rows, robot.couplings.values(), strict=True):
+        row[column] = ratio
+    return ca.sparsify(ca.DM(rows))
+
+
 def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
     """Return the frames of all links in the world, by link name, the root link first."""
     return frames_and_axes(robot, q, world_from_base)[0]
@@ -143,15 +146,14 @@ def frame_jacobian(
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the geometric Jacobian of a point fixed in a link: the matrix from joint rates to (angular velocity,
-    velocity of the point) in world axes.
+    """Return the matrix, (6, dof), from joint rates to the (angular, linear) velocity of a point of a link, in world
+    axes.
+
+    Columns of joints that do not carry the link are zero.
 
     Args:
         link: Name of the link.
         point: In the link's frame. Shape (3,), m.
-
-    Returns:
-        Shape (6, dof). Columns of joints that do not carry the link are zero.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
     robot.link(link)
@@ -166,9 +168,7 @@ def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | Non
 
 
 def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the geometric Jacobian of the tip frame: the matrix from joint rates to its (angular, linear) velocity in
-    world axes. Shape (6, dof).
-    """
+    """Return the matrix, (6, dof), from joint rates to the tip's (angular, linear) velocity in world axes."""
     tip = require.instance("kinematics: robot", robot, Robot).tip_link
     return frame_jacobian(robot, q, tip, point=robot.tip_translation, world_from_base=world_from_base)
 
@@ -176,10 +176,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the geometric Jacobian of a point of a link, given in the world, from known joint axes. Shape (6, dof).
-
-    The point is in world; the axes are those of frames_and_axes.
-    """
+    """Return the geometric Jacobian, (6, dof), of a point of a link, in world, from joint axes of frames_and_axes."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -252,19 +249,13 @@ def constant(array: Array) -> Expression:
 
 
 class LinkMotion(NamedTuple):
-    """Motion of a link in world axes: position, velocity and acceleration of its centre of mass, and its rotation.
+    """Motion of a link in world axes: position, velocity and acceleration of its centre of mass, and its rotation."""
 
-    Attributes:
-        center: Position of the centre of mass. Shape (3, 1), m.
-        velocity, acceleration: Of the centre of mass. Shape (3, 1).
-        angular_velocity, angular_acceleration: Shape (3, 1).
-    """
-
-    center: Expression
-    velocity: Expression
-    acceleration: Expression
-    angular_velocity: Expression
-    angular_acceleration: Expression
+    center: Expression  # position of the centre of mass. Shape (3, 1), m.
+    velocity: Expression  # of the centre of mass. Shape (3, 1).
+    acceleration: Expression  # of the centre of mass. Shape (3, 1).
+    angular_velocity: Expression  # shape (3, 1)
+    angular_acceleration: Expression  # shape (3, 1)
 
 
 class CenterOfMassMotion(NamedTuple):
@@ -349,16 +340,11 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """Return the manipulability of a task that fixes components of the tip's twist; zero where the task is singular.
-
-    sqrt(det(G_r G_r')) of the rows r of the tip Jacobian G (Yoshikawa 1985).
+    """Return sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985), zero where the task is singular.
 
     Args:
         jacobian: Shape (6, n).
         rows: Rows of the twist that the task fixes: angular 0..2, linear 3..5.
-
-    Returns:
-        Shape (1, 1).
 
     Raises:
         ModelError: Rows out of range, repeated, or none.

@@ -1,8 +1,8 @@
 """Reading of robot descriptions in MJCF, the XML format of MuJoCo, whose own compiler resolves classes and frames.
 
-A file from a stranger is reduced before the compiler sees it: only parts that describe bodies, joints, shapes and
-actuators remain, so that it loads no plugin, simulates nothing and expands no repetition. Files are opened here and not
-by the compiler. Included files must be inside the folder of the first one.
+A file from a stranger is reduced before the compiler sees it to the parts that describe bodies, joints, shapes and
+actuators, so that it loads no plugin, simulates nothing and expands no repetition. Files are opened here, and included
+files must be inside the folder of the first one.
 """
 
 from __future__ import annotations
@@ -137,27 +137,17 @@ def excluded_pairs(source: Source) -> list[tuple[str, str]]:
 
 
 class _ReducedFile(NamedTuple):
-    """An MJCF description reduced to the elements that describe bodies, joints, shapes and actuators.
+    """An MJCF description reduced to the elements that describe bodies, joints, shapes and actuators."""
 
-    Attributes:
-        text: MJCF.
-        name: Name of the model.
-        folder: Folder of the file, "" for a text.
-        files: Files of the meshes, relative to the folder, by their names in the text.
-        origin: Description of the source, for messages.
-    """
-
-    text: str
-    name: str
-    folder: str
-    files: dict[str, Path]
-    origin: str
+    text: str  # MJCF
+    name: str  # name of the model
+    folder: str  # folder of the file, "" for a text
+    files: dict[str, Path]  # files of the meshes, relative to the folder, by their names in the text
+    origin: str  # description of the source, for messages
 
 
 def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:
-    """Read an MJCF description and keep only what describes bodies, joints, shapes and actuators; append descriptions
-    of equality constraints that are left out to `omitted`.
-    """
+    """Read an MJCF description, reduced to what describes a robot; append words on omitted constraints."""
     tree, origin = parse_file(source, "MJCF")
     if tree.tag != "mujoco":
         hint = "; read URDF with Robot.from_urdf" if tree.tag == "robot" else ""
@@ -231,10 +221,10 @@ def _is_read(part: ElementTree.Element, parent: str) -> bool:
 
 
 def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
-    """Return MuJoCo's compiled model, with spheres in place of meshes, and by index of the geom the mesh that each
-    sphere replaces (None for height fields and for primitives fitted to meshes).
+    """Return MuJoCo's compiled model, with spheres for meshes, and by index of the geom the mesh that each sphere
+    replaces.
 
-    Meshes are opened only if the masses of bodies follow from them.
+    The mesh is None for height fields and fitted primitives. Mesh files are opened only if masses follow from them.
     """
     try:
         import mujoco
@@ -273,8 +263,8 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
 
 
 def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any, str]]:
-    """Replace geoms that are meshes or height fields by spheres, except on bodies that `is_kept` accepts; return the
-    replaced geoms with the names of their meshes.
+    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return these geoms with
+    mesh names.
 
     The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh "".
     """
@@ -291,11 +281,7 @@ def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any
 def _body_shapes(
     model: Any, meshes: Mapping[int, Any], reduced: _ReducedFile, omitted: list[str]
 ) -> list[dict[str, Any]]:
-    """Return the shapes of each body of a MuJoCo model as arguments of Link; append words on omitted ones to `omitted`.
-
-    Args:
-        model, meshes: As returned by _compile.
-    """
+    """Return the shapes of each body as arguments of Link, given results of _compile; append words on omitted ones."""
     shapes: list[dict[str, Any]] = [{"collisions": (), "visuals": ()} for _ in range(model.nbody)]
     for k in range(model.ngeom):
         parts = shapes[model.geom_bodyid[k]]
@@ -324,9 +310,7 @@ def _body_shapes(
 
 
 def _primitive(number: int, size: Array) -> tuple[ShapeKind, tuple[float, ...]]:
-    """Return kind and size of the collision shape for MuJoCo's type number and half sizes of a geom; no size for a
-    plane.
-    """
+    """Return kind and size of a shape from MuJoCo's type number and half sizes of a geom; no size for a plane."""
     a, b, c = size.tolist()
     kinds: dict[int, tuple[ShapeKind, tuple[float, ...]]] = {
         2: ("sphere", (a,)),
@@ -371,9 +355,7 @@ def _effort(model: Any, j: int) -> float:
 
 
 def _equalities(model: Any, omitted: list[str]) -> tuple[dict[int, Mimic], dict[int, float]]:
-    """Return, by number of the joint, couplings to other joints and positions of locked joints that equality
-    constraints state; append descriptions of other constraints to `omitted`.
-    """
+    """Return couplings and locked positions by number of the joint; append words on other constraints."""
     mimics: dict[int, Mimic] = {}
     locked: dict[int, float] = {}
     for k in (k for k in range(model.neq) if model.eq_active0[k]):

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, freeze, require, warn_of_degrees, warn_of_millimetres
+from models.checks import Array, ArrayInput, freeze, require, set_fields, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import rotation
 
@@ -62,11 +62,10 @@ class CollisionShape:
             raise ModelError(f"{owner}: a mesh needs the name of its file", name="file", value=self.file)
         if not size.all():
             raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
+        set_fields(self, size=size, translation=require.array(f"{owner}: translation", self.translation, (3,)))
         if not mesh and not isinstance(self, VisualShape):
             warn_of_millimetres(f"{owner}: size", size)
-        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
+        set_fields(self, rotation=require.rotation(f"{owner}: rotation", self.rotation))
 
     def placed(self, rotation: Array, translation: Array) -> Self:
         """Return the shape in another frame, in which its link has a given rotation (3, 3) and translation (3,), m."""
@@ -97,7 +96,7 @@ class VisualShape(CollisionShape):
         if not ((color >= 0) & (color <= 1)).all():
             message = f"visual {self.kind}: color {color.tolist()} has entries outside 0 to 1"
             raise ModelError(message, name="color", value=color, limit=(0.0, 1.0))
-        object.__setattr__(self, "color", color)
+        set_fields(self, color=color)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +131,11 @@ class Link:
         mass = require.nonnegative(f"{owner}: mass", self.mass, unit="kg")
         inertia = require.array(f"{owner}: inertia", self.inertia, (3, 3))
         _check_inertia(inertia, owner, self.any_inertia)
-        object.__setattr__(self, "mass", mass)
-        object.__setattr__(self, "center_of_mass", require.array(f"{owner}: center_of_mass", self.center_of_mass, (3,)))
+        set_fields(self, mass=mass, center_of_mass=require.array(f"{owner}: center_of_mass", self.center_of_mass, (3,)))
         warn_of_millimetres(f"{owner}: center_of_mass", self.center_of_mass, self.name)
-        object.__setattr__(self, "inertia", freeze((inertia + inertia.T) / 2))
-        object.__setattr__(self, "collisions", require.each(f"{owner}: collisions", self.collisions, CollisionShape))
-        object.__setattr__(self, "visuals", require.each(f"{owner}: visuals", self.visuals, VisualShape))
+        set_fields(self, inertia=freeze((inertia + inertia.T) / 2))
+        set_fields(self, collisions=require.each(f"{owner}: collisions", self.collisions, CollisionShape))
+        set_fields(self, visuals=require.each(f"{owner}: visuals", self.visuals, VisualShape))
 
 
 @dataclass(frozen=True)
@@ -161,7 +159,7 @@ class Mimic:
         owner = f"mimic of joint {require.name('mimic: joint', self.joint)!r}"
         for argument in ("multiplier", "offset"):
             number = require.number(f"{owner}: {argument}", getattr(self, argument))
-            object.__setattr__(self, argument, number)
+            set_fields(self, **{argument: number})
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,12 +215,12 @@ class Joint:
         length = float(np.linalg.norm(axis))
         if not length > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axis", value=axis)
-        object.__setattr__(self, "axis", freeze(axis / length))
-        object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
-        object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
+        set_fields(self, axis=freeze(axis / length))
+        set_fields(self, translation=require.array(f"{owner}: translation", self.translation, (3,)))
+        set_fields(self, rotation=require.rotation(f"{owner}: rotation", self.rotation))
         for name in ("lower", "upper", "velocity", "effort"):
             limit = require.number(f"{owner}: {name}", getattr(self, name), finite=False)
-            object.__setattr__(self, name, limit)
+            set_fields(self, **{name: limit})
             if name in ("velocity", "effort") and limit < 0:
                 raise ModelError(f"{owner}: {name} limit {limit} is negative", name=name, value=limit, limit=0.0)
         limits = (self.lower, self.upper)
@@ -387,10 +385,8 @@ def _write_origin(element: ElementTree.Element, translation: Array, rotation: Ar
 
 
 def _rpy(rotation: Array) -> Array:
-    """Return roll, pitch and yaw (about the fixed x, y, z axes) of a rotation matrix. Shape (3,), rad.
-
-    At pitch = +-pi/2 yaw is arbitrary; roll is computed relative to that yaw, so the rotation is exact to rounding
-    there too.
+    """Return roll, pitch and yaw of a rotation matrix, (3,), rad; at pitch +-pi/2 yaw is arbitrary and roll relative to
+    it.
     """
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))

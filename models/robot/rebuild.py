@@ -176,11 +176,7 @@ def add_prefix(robot: Robot, prefix: str) -> Robot:
 
 
 def reroot(robot: Robot, root: str) -> Robot:
-    """Return the robot with another link as the root of its tree.
-
-    Links keep their frames, joints their names, limits and signs. See `models.robot.tree.reroot_tree` for the massless
-    links that this adds.
-    """
+    """Return the robot with another link as the root of its tree, see `models.robot.tree.reroot_tree`."""
     links, joints = reroot_tree(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 

@@ -14,7 +14,7 @@ from warnings import warn
 
 import numpy as np
 
-from models.checks import Array, ArrayInput, require, warn_of_millimetres
+from models.checks import Array, ArrayInput, require, set_fields, warn_of_millimetres
 from models.errors import ModelError, ModelWarning
 from models.robot.mjcf import read_mjcf
 from models.robot.parts import Joint, Link, urdf_text
@@ -71,17 +71,13 @@ class Robot:
         joints = lock_with_followers(joints, {})
         names, edges = [link.name for link in links], [(joint.name, joint.parent, joint.child) for joint in joints]
         root = find_root(names, edges)
-        object.__setattr__(self, "root", root)
-        object.__setattr__(self, "links", links)
-        object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
+        set_fields(self, root=root, links=links, joints=tuple(joints[i] for i in tree_order(root, edges)))
         if self.tip is None:
-            object.__setattr__(self, "tip", self._leaves[0] if len(self._leaves) == 1 else None)
+            set_fields(self, tip=self._leaves[0] if len(self._leaves) == 1 else None)
         elif not isinstance(self.tip, str) or self.tip not in names:
             raise require.unknown("tip link", self.tip, names)
-        object.__setattr__(
-            self, "tip_translation", require.array(f"{owner}: tip_translation", self.tip_translation, (3,))
-        )
-        object.__setattr__(self, "tip_rotation", require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
+        set_fields(self, tip_translation=require.array(f"{owner}: tip_translation", self.tip_translation, (3,)))
+        set_fields(self, tip_rotation=require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
         warn_of_millimetres(f"{owner}: tip_translation", self.tip_translation)
         _ = self._limits  # raises if mimic joints leave a joint no position
 

@@ -1,12 +1,11 @@
 """Kinematic trees: root, order of the joints, change of the root, mimic joints, joints with several degrees of freedom.
 
-The position of a mimic joint, or follower (<mimic> in URDF), is multiplier times that of the joint it mimics, plus
-offset. Mimic joints may mimic each other in a chain. The joint at its end, which mimics none, is the leader; only
-leaders have an entry in the joint vector.
+The position of a mimic joint, or follower, is multiplier times that of the joint it mimics, plus offset. Mimic joints
+may mimic each other in a chain. Only the joint at its end, the leader, has an entry in the joint vector.
 
-Planar and floating joints become chains of joints with one degree of freedom on massless links, "NAME_x" and so on.
-A planar joint has the coordinates x, y and angle, as a `FreeFloating` machine with a planar base. A floating joint has
-x, y, z, yaw, pitch and roll, with the rotation Rz(yaw) Ry(pitch) Rx(roll), singular at a pitch of +-pi/2.
+Planar and floating joints become chains of joints with one degree of freedom on massless links, "NAME_x" and so on: x,
+y and angle; or x, y, z, yaw, pitch and roll, with the rotation Rz(yaw) Ry(pitch) Rx(roll), singular at a pitch of
++-pi/2.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ def require_unique(names: Iterable[str], kind: str) -> None:
 
 
 def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> str:
-    """Return the name of the root of a kinematic tree: the only link that is not the child of a joint.
+    """Return the root of a kinematic tree, the only link that is not the child of a joint.
 
     Args:
         links: Names of the links, unique.
@@ -71,9 +70,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Return the indices of the joints of a kinematic tree in an order in which every joint precedes its descendants.
-
-    The order of declaration is kept where possible.
+    """Return the indices of the joints so that every joint precedes its descendants, else in the order of declaration.
 
     Raises:
         ModelError: Some links form a loop that is not connected to the root.
@@ -141,12 +138,8 @@ LIMITS = ("lower", "upper", "velocity", "effort")
 
 
 class JointCoupling(NamedTuple):
-    """Coupling of a joint to the joint vector: its position is multiplier times an entry of the vector, plus offset.
-
-    Attributes:
-        column: Index of that entry.
-        multiplier: rad or m per rad or m of the entry.
-        offset: rad or m.
+    """Coupling of a joint to the joint vector: position = multiplier times the entry `column` of the vector, plus
+    offset.
     """
 
     column: int
@@ -233,12 +226,11 @@ def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
 
 
 def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]) -> dict[str, Array]:
-    """Return the limits "lower", "upper", "velocity" and "effort", by name, of all independent joints. Shape (dof,)
-    each.
+    """Return "lower", "upper", "velocity" and "effort" limits, (dof,) each, of all independent joints.
 
-    Mimic joints must keep their own limits, so they narrow positions and speed of the joint that they mimic. Effort is
-    that of its actuator, which also drives them. A velocity or effort of 0 means, as in many URDF files, that
-    the limit is unknown; it becomes infinite.
+    Mimic joints must keep their own limits, so they narrow positions and speed of the joint that they mimic; effort is
+    that of its actuator. A velocity or effort of 0 means, as in many URDF files, that the limit is unknown; it becomes
+    infinite.
 
     Raises:
         ModelError: Limits of mimic joints leave the mimicked joint no position.
@@ -276,13 +268,9 @@ Parts: TypeAlias = tuple[tuple[Link, ...], tuple[Joint, ...]]
 def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
     """Return the links and joints of a robot with a planar joint replaced by the joints NAME_x, NAME_y, NAME_angle.
 
-    The plane is the one through the joint frame across the axis, the xy plane without an axis. For any other axis, the
-    frame is turned by the least rotation that takes its z axis to the axis or the opposite direction.
-
-    Args:
-        place: Fixed joint with the name, links and frame of the planar one.
-        axis: Normal of the plane in the joint frame, of any nonzero length, shape (3,); or None.
-        links, joints: Of the robot, with that joint.
+    The plane is the one across `axis` (of any length; None: z) through the frame of `place`, a fixed joint that stands
+    for the planar one. For another axis, the frame is turned by the least rotation that takes z to the axis or its
+    opposite.
     """
     normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
     normal = normal if normal[2] >= 0 else -normal
@@ -292,15 +280,10 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return the links and joints of a robot without a given floating joint: it becomes the base of the whole robot, or
-    a chain of six joints.
+    """Return the links and joints of a robot without a floating joint, for which the fixed joint `place` stands.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
-
-    Args:
-        place: Fixed joint with the name, links and frame of the floating one.
-        links, joints: Of the robot, with that joint.
 
     Warns:
         ModelWarning: The omitted root has collision shapes.
@@ -323,10 +306,7 @@ def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint
 def _replace_by_chain(
     place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
 ) -> Parts:
-    """Return the links and joints of a robot with one joint replaced by several joints of one degree of freedom each.
-
-    `steps` has the suffix of the name, the kind and the axis of each new joint; the links between them are massless.
-    """
+    """Return a robot with one joint replaced by several; `steps` has suffix of the name, kind and axis of each."""
     new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
     ends = [place.parent, *(link.name for link in new_links), place.child]
     chain = [

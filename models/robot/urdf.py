@@ -1,10 +1,8 @@
 """Reading of robot descriptions in URDF, the XML format of ROS, also from xacro; `parts` writes them.
 
-Read are kinematics, inertias, limits, mimic joints, collision and visual shapes. <transmission>, <gazebo>,
-<safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped. Faults that other readers
-accept, such as a misspelt attribute or a collision shape of size zero, are left out with a warning that names them.
-Mesh files are recorded by name and folder but not opened here; `models.shapes.bodies` reads them. The standard
-library's XML parser suffices: packages that read URDF depend on mesh and XML packages, which the core does without.
+<transmission>, <gazebo>, <safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped.
+Faults that other readers accept are left out with a warning that names them. Mesh files are recorded by name and
+folder; `models.shapes.bodies` reads them.
 """
 
 from __future__ import annotations
@@ -65,18 +63,12 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Content of a robot description (URDF or MJCF): name, links, joints and tip.
+    """Content of a robot description (URDF or MJCF): name, links, joints and tip."""
 
-    Attributes:
-        name: Name of the robot; "robot" if the file has none.
-        links, joints: In the order of the file.
-        tip: Link that carries the tip, from the non-standard element <tip link="NAME"/>, or None.
-    """
-
-    name: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
-    tip: str | None = None
+    name: str  # name of the robot; "robot" if the file has none
+    links: tuple[Link, ...]  # in the order of the file
+    joints: tuple[Joint, ...]  # in the order of the file
+    tip: str | None = None  # link that carries the tip, from the non-standard element <tip link="NAME"/>, or None
 
 
 def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
@@ -166,12 +158,9 @@ def expand_xacro(file: str | os.PathLike[str]) -> str:
 
 
 def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.Element:
-    """Return the <robot> element of a URDF or SRDF text or file, without namespaces.
+    """Return the <robot> element of a URDF or SRDF text or file, without namespaces and undeclared prefixes.
 
-    Args:
-        source: The text, or the path of a file.
-        omitted: List to which descriptions of the parts without meaning are appended: of undeclared namespace prefixes,
-            which are not in the result, and of calls of macros.
+    Descriptions of omitted prefixes and of calls of macros are appended to `omitted`.
 
     Raises:
         ModelError: The source is unreadable, or xacro.
@@ -268,13 +257,7 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: l
 def _link_arguments(
     element: ElementTree.Element, folder: str, colors: dict[str | None, Array], omitted: list[str]
 ) -> dict[str, Any]:
-    """Return the arguments of `Link` that a <link> element of URDF describes.
-
-    Args:
-        element, folder: The element, and the folder of its file.
-        colors: Colours of the robot's materials, by name.
-        omitted: List to which descriptions of collision shapes that are left out are appended.
-    """
+    """Return the arguments of `Link` that a <link> element describes; append omitted collision shapes to `omitted`."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes: list[CollisionShape] = []
@@ -317,13 +300,8 @@ def _shape(
     omitted: list[str],
     **arguments: Any,
 ) -> list[_Shape]:
-    """Return a list of the shape that a <collision> or <visual> element describes, empty if it has no volume.
-
-    Args:
-        element, owner, folder: The element, its link, for messages, and the folder of its file.
-        shape_type: Class of the result.
-        omitted: List to which descriptions of shapes that are left out are appended.
-        arguments: Further arguments of the result.
+    """Return a list of the shape of a <collision> or <visual> element, empty if it has no volume, which is noted in
+    `omitted`.
     """
     shapes: list[Any] = list(child_of(element, "geometry", owner))
     if not shapes:
@@ -387,9 +365,8 @@ def _axis(element: ElementTree.Element) -> Array | None:
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
     """Return descriptions of unknown attributes in a <link> or <joint> element that may be misspelt known ones.
 
-    An attribute that resembles a missing known one, or nearly equals any known one, is taken for a misspelling.
-    Other unknown attributes of an element that has all known ones are an extension and are skipped, like unknown
-    elements.
+    An attribute that resembles a missing known one, or nearly equals any known one, is taken for a misspelling. Other
+    unknown attributes of an element that has all known ones are an extension and are skipped.
     """
     unknown = []
     parents = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
@@ -462,12 +439,7 @@ def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int, *, finite: bool = True) -> Array:
-    """Return an attribute of an XML element as an array of `count` numbers; raise ModelError for any other content.
-
-    Args:
-        owner: Description of the element, for messages.
-        finite: Refuse inf and nan as well.
-    """
+    """Return an attribute of an XML element as an array of `count` numbers; raise ModelError for any other content."""
     text = text_of(element, key, owner)
     place = f"{owner}: {key}={text!r} of <{element.tag}>"
     try:

@@ -17,7 +17,7 @@ from warnings import warn
 
 import numpy as np
 
-from models.checks import Array, require
+from models.checks import Array, require, set_fields
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Joint, Link
 from models.robot.robot import Robot
@@ -35,15 +35,10 @@ MAX_CAPSULE_VOLUME = 1.25
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """A mesh of a link, which one or more collision bodies (capsules or a box) cover.
+    """A mesh of a link, which one or more collision bodies (capsules or a box) cover."""
 
-    Attributes:
-        points: Vertices in the frame of the link. Shape (n, 3), m.
-        number: Index of the mesh among the collision shapes of the link.
-    """
-
-    points: Array
-    number: int = 0
+    points: Array  # vertices in the frame of the link. Shape (n, 3), m.
+    number: int = 0  # index of the mesh among the collision shapes of the link
 
     @cached_property
     def hull(self) -> Mesh:
@@ -80,7 +75,7 @@ class Body:
         if not np.isfinite(reach):
             message = f"{owner}: shape {self.shape!r} is unbounded; give a bounded one"
             raise ModelError(message, name="shape", value=self.shape)
-        object.__setattr__(self, "overhang", require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
+        set_fields(self, overhang=require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
 
 
 def collision_bodies(
@@ -162,16 +157,11 @@ def _primitive_body(link: Link, shape: CollisionShape) -> Body:
 
 
 def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
-    """Return volume, size and protrusion of the smallest capsule that encloses a cylinder.
+    """Return volume (m^3), size (radius, length without caps, m) and protrusion (m) of the smallest capsule around a
+    cylinder.
 
     With the capsule radius R, the rims of the cylinder of radius r lie on the caps, which begin sqrt(R^2 - r^2) before
     the cylinder's ends.
-
-    Args:
-        radius, length: Size of the cylinder, m.
-
-    Returns:
-        Volume, m^3; radius R and length without the caps, m; distance by which the poles protrude, m.
     """
     largest = float(np.hypot(radius, length / 2))
     # dense near the cylinder's radius, where the cap length changes most
@@ -207,33 +197,21 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
 
 
 class JointStep(NamedTuple):
-    """A moving joint between two rigid parts of a robot (`RigidParts`): the part above and the part below the joint.
+    """A moving joint between two rigid parts of a robot (`RigidParts`)."""
 
-    Attributes:
-        joint: Its child link names the part below.
-        rotation, translation: Pose of the joint frame in the part above. Shapes (3, 3); (3,), m.
-        above: Name of the part above.
-    """
-
-    joint: Joint
-    rotation: Array
-    translation: Array
-    above: str
+    joint: Joint  # its child link names the part below
+    rotation: Array  # of the joint frame in the part above. Shape (3, 3).
+    translation: Array  # of the joint frame in the part above. Shape (3,), m.
+    above: str  # name of the part above
 
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Sets of links that no moving joint separates; each set is named after the link nearest to the root.
+    """Sets of links that no moving joint separates; each set is named after the link nearest to the root."""
 
-    Attributes:
-        of_link: The part of each link.
-        pose: Rotation and translation of each link in the frame of its part.
-        step: The joint above each part but the root's.
-    """
-
-    of_link: dict[str, str]
-    pose: dict[str, tuple[Array, Array]]
-    step: dict[str, JointStep]
+    of_link: dict[str, str]  # the part of each link
+    pose: dict[str, tuple[Array, Array]]  # rotation and translation of each link in the frame of its part
+    step: dict[str, JointStep]  # the joint above each part but the root's
 
     @classmethod
     def of(cls, robot: Robot) -> RigidParts:

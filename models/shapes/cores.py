@@ -1,8 +1,7 @@
 """Signed distances of points, segments and boxes, the cores of shapes, as CasADi expressions.
 
-Separated cores have the distance of their closest points, the root of a minimum over positions on them. Overlapping
-cores have minus their penetration depth, the largest gap along the candidate separating axes. Every formula accepts
-scalars or columns of scalars, and has a smooth lower bound for second-order methods, see `models.shapes.distance`.
+Every formula accepts scalars or columns of scalars, and has a smooth lower bound for second-order methods; see
+`models.shapes.distance`.
 """
 
 from __future__ import annotations
@@ -89,19 +88,15 @@ def _root(square: Expression, excess: float = 0.0) -> Expression:
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """Return the smaller of a gap and zero, or a smooth lower bound of this minimum.
-
-    The smoothing width `rounding` bounds the error by rounding / 4; gaps of at least `rounding` give zero.
-    """
+    """Return the smaller of a gap and zero, or a smooth lower bound of it, at most `rounding` / 4 below."""
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
 
 
 def _positive_part(gap: Expression, rounding: float) -> Expression:
-    """Return a smooth lower bound of the larger of a gap and zero; the bound is zero for negative gaps.
-
-    The smoothing width `rounding` bounds the error by rounding / 2.
+    """Return a smooth lower bound of the larger of a gap and zero, at most `rounding` / 2 below, zero for negative
+    gaps.
     """
     return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 * (0.5 / rounding)
 
@@ -136,9 +131,8 @@ def distance_of_segments(
 def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_gradient: StopGradient) -> Expression:
     """Return the least squared distance of two segments, smoothed by a penalty on the closest points if `weight` > 0.
 
-    The minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2). The unconstrained s is
-    clipped to 0..1, then t is optimised for it and clipped, then s for that t (Ericson, Real-Time Collision Detection,
-    2005, 5.1.9).
+    The minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2) by clipping s, then t,
+    then s again (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
     """
     a, e, b = dot(u, u) + weight + KINK**2, dot(v, v) + weight + KINK**2, dot(u, v)
     c, f = dot(u, gap) - weight / 2, dot(v, gap) + weight / 2
@@ -157,10 +151,9 @@ def distance_to_box(
 ) -> Expression:
     """Return the signed distance of a point, a segment or a box to another box.
 
-    It is the root of the smallest square for separated cores and minus the penetration depth, the largest gap along the
-    candidate separating axes, for overlapping ones. The rounded distance of two boxes, which an interior-point method
-    differentiates twice at every point of a motion, is a bound without these squares at a fifth of the cost. It also
-    uses the distance of each box to the bounding box of the other along its own axes.
+    The rounded distance of two boxes, which an interior-point method differentiates twice, is a bound without the
+    squares of closest points, at a fifth of the cost. It also uses the distance of each box to the bounding box of the
+    other along its own axes.
     """
     middle, axes, halves = _in_box_axes(core, box)
     if not axes:
@@ -203,11 +196,9 @@ def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, lis
 def _separating_gaps(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, slack: Expression
 ) -> list[Expression]:
-    """Return the gaps between a segment or box and another box along possible separating axes.
+    """Return the gaps between a segment or box and another box along face normals and cross products of edges.
 
-    These are the face normals of both and the cross products of their edges (Gottschalk, Lin & Manocha 1996). The
-    absolute values of cosines have kinks at aligned boxes; a positive slack replaces them by smooth upper bounds, at
-    most the slack above.
+    Absolute values of cosines have kinks at aligned boxes; a positive slack replaces them by smooth upper bounds.
     """
     sizes = [triple(smooth_abs(share, slack) for share in axis) for axis in axes]
     sums = [sum(h * size[i] for h, size in zip(halves, sizes, strict=True)) for i in range(3)]
@@ -244,11 +235,9 @@ def _segment_box_square(
     """Return the squared distance of a segment (in the box's axes) from a box, plus a penalty if `weight` > 0.
 
     The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
-    weight s plus a term for each axis, u_k times the excess of x_k over the box. A term is zero while x_k is inside the
-    box and linear outside. The axes enter one by one: first that of the largest excess over |u_k| at s = 0; then, of
-    the others, the largest at the minimum of the first; then the last, if its excess is nonzero at the minimum of
-    these. Because an axis that enters later never moves s out of the linear range of an earlier one, three steps find
-    the minimum. Derivatives do not pass through the intermediate positions.
+    weight s plus, for each axis, u_k times the excess of x_k over the box, which is zero inside and linear outside. The
+    axes enter one by one, that of the largest relative excess first. An axis that enters later never moves s out of the
+    linear range of an earlier one, so three steps find the minimum.
     """
     sizes, squares = triple(ca.fabs(part) + KINK for part in u), triple(part * part for part in u)
     s, pull, rise = 0.0, 0.0, weight + KINK**2
@@ -282,8 +271,8 @@ def _edge_squares(
 ) -> list[Expression]:
     """Return the squared distances of the twelve edges of a box from another box, in whose axes the first is given.
 
-    Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
-    face, at constant distance, to a corner or an edge.
+    With the corners of the other box they suffice: from a closest point inside a face one can slide to a corner or an
+    edge.
     """
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
     squares = []

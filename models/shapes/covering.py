@@ -1,9 +1,7 @@
 """Covers of a triangle mesh by a few capsules or one box, whose distances can be computed exactly and fast.
 
-First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
-covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
-number of parts weighs volume against cost. A box replaces the capsules where it is clearly smaller, because distances
-of boxes cost many times more.
+One capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the covered
+volume most, each side gets its own capsule, and so on. A box replaces the capsules where it is clearly smaller.
 
 Every triangle, split at the planes, lies in the capsule of its part. So do all points that a closed surface encloses:
 from a point between two planes of a split, a line parallel to the planes meets the surface between them.
@@ -32,45 +30,25 @@ class CoverSettings:
     """Settings of the search for capsules or a box that cover a mesh.
 
     Lengths and volumes are relative to a mesh whose largest extent is 1.
-
-    Attributes:
-        parts: Largest number of capsules. The distances of more would cost more than their tighter fit saves.
-        worth_a_part: Factor by which the covered volume must fall for each additional part. A lower overhang counts
-            too, by its fourth root.
-        worth_a_box: Volume of the box over that of the capsules below which the box is taken.
-        cuts: Positions of the planes that are tried, relative to the extent along an axis; the best is refined by steps
-            of half and a quarter of the first.
-        growth: Margin added to covers, larger than rounding errors.
-        thinnest: Smallest thickness of a box, which must not be zero.
-        directions: Initial directions of capsule axes on a hemisphere.
-        extremes: Directions whose extreme points take part in a fit, a multiple of 32.
-        trial_directions, trial_extremes: The same for a split that is only tried.
-        simplex: Initial steps of the simplex search: two slopes of the axis, its position across, root of the excess
-            radius.
-        parameter_tolerance, volume_tolerance: Termination tolerances of these parameters and of the relative volume.
-        radii: Initial radii, relative to the enclosing cylinder's.
-        max_triangles: Number of triangles that splits are tried on: the largest ones and the extreme vertices.
-        grid: Number of points that estimate the covered volume, to about one percent.
-        samples: Number of surface points at which the overhang of a cover is measured.
     """
 
-    parts: int = 3
-    worth_a_part: float = 1.07
-    worth_a_box: float = 0.7
-    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)
-    growth: float = 1e-9
-    thinnest: float = 1e-6
-    directions: int = 48
-    extremes: int = 256
-    trial_directions: int = 24
-    trial_extremes: int = 64
-    simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)
-    parameter_tolerance: float = 4e-3
-    volume_tolerance: float = 4e-4
-    radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)
-    max_triangles: int = 1500
-    grid: int = 6000
-    samples: int = 150
+    parts: int = 3  # largest number of capsules; distances of more would cost more than their fit saves
+    worth_a_part: float = 1.07  # factor by which volume (or overhang, by its fourth root) must fall for a part
+    worth_a_box: float = 0.7  # volume of the box over that of the capsules below which the box is taken
+    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
+    growth: float = 1e-9  # margin added to covers, larger than rounding errors
+    thinnest: float = 1e-6  # smallest thickness of a box, which must not be zero
+    directions: int = 48  # initial directions of capsule axes on a hemisphere
+    extremes: int = 256  # directions whose extreme points take part in a fit, a multiple of 32
+    trial_directions: int = 24  # directions for a split that is only tried
+    trial_extremes: int = 64  # extremes for a split that is only tried
+    simplex: tuple[float, ...] = (0.25, 0.25, 0.05, 0.05, 0.2)  # initial steps of the parameters of a capsule
+    parameter_tolerance: float = 4e-3  # termination tolerance of these parameters
+    volume_tolerance: float = 4e-4  # termination tolerance of the relative volume
+    radii: tuple[float, ...] = (1.0, 1.02, 1.06, 1.15, 1.3)  # initial radii, relative to the enclosing cylinder's
+    max_triangles: int = 1500  # number of triangles that splits are tried on: the largest ones and the extreme vertices
+    grid: int = 6000  # number of points that estimate the covered volume, to about one percent
+    samples: int = 150  # number of surface points at which the overhang of a cover is measured
 
 
 SETTINGS = CoverSettings()
@@ -80,15 +58,10 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes.
+    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes."""
 
-    Attributes:
-        shape: Capsule or box in the frame of the mesh.
-        overhang: Largest distance of sampled surface points of the shape from the convex hull of the mesh, m.
-    """
-
-    shape: CoverShape
-    overhang: float
+    shape: CoverShape  # capsule or box in the frame of the mesh
+    overhang: float  # largest distance of sampled surface points of the shape from the convex hull of the mesh, m
 
 
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
@@ -186,7 +159,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
     """Return volume, radius, ends, axis and a point of the axis of the capsule around points for given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
-    radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
+    radius.
     """
     a, b, x, y, fat = parameters.tolist()
     length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
@@ -205,9 +178,8 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
-    """Return a small capsule around points whose axis is the last axis of one of k given bases, shape (k, 3, 3).
-
-    It is given by its parameters in that basis, as `_evaluate_capsule` takes them, the basis, and the volume.
+    """Return parameters (as in `_evaluate_capsule`), basis and volume of a small capsule around points; bases (k, 3,
+    3).
     """
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
@@ -250,10 +222,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the two parts of a mesh, split by a plane, whose covering capsules have the least total volume.
-
-    If no plane splits the part, the part itself is returned.
-    """
+    """Return the two parts of a mesh, split by a plane, of least covered volume; the part itself if none splits it."""
     points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
@@ -286,9 +255,8 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return sample points spread evenly in a box 1.5 times as large as given points' extent, and the box's volume.
-
-    They serve to estimate covered volumes: the box contains nearly all of the covers. Shape (k, 3).
+    """Return points, (k, 3), spread evenly in a box that contains nearly all of the covers of given points, and its
+    volume.
     """
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
@@ -336,9 +304,8 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points.
-
-    One of its faces lies along a face of the hull of the extreme points, one of its edges along an edge.
+    """Return a box of nearly least volume around points, with a face along a face of the hull and an edge along an
+    edge.
     """
     frames = [_principal_axes(points)]
     try:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache, reduce
+from itertools import accumulate, pairwise
 from math import cos, log, pi
 from typing import Any, NamedTuple, TypeAlias
 
@@ -83,20 +84,17 @@ def distance(
     exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its prism) beside a half-space.
     Other pairs with a mesh or a cylinder get a lower bound, the largest gap along the normals of their faces.
 
-    The exact distance of capsules and boxes has kinks: near parallel segments the closest points jump from end to end,
-    and second-order methods zigzag there. With rounding e > 0 the result is a smooth lower bound on which an
-    interior-point method converges; planners use this form. It minimises the squared distance over positions s, t in
-    0..1 along the segments with e^2 ((s - 1/2)^2 + (t - 1/2)^2) added. This problem is strictly convex, so positions
-    and gradient are Lipschitz. The added term is at most c = e^2/2, or e^2/4 with one segment. The minimum M lies in
-    d^2..d^2 + c, so (M - c)/sqrt(M + c) is at most d and smooth, without the infinite slope of sqrt(M - c).
+    The exact distance of capsules and boxes has kinks, where second-order methods zigzag. With rounding e > 0 the
+    result is a smooth lower bound on which an interior-point method converges. It minimises the squared distance over
+    positions s, t in 0..1 along the segments with e^2 ((s - 1/2)^2 + (t - 1/2)^2) added. This problem is strictly
+    convex, so positions and gradient are Lipschitz. The added term is at most c = e^2/2, or e^2/4 with one segment. The
+    minimum M lies in d^2..d^2 + c, so (M - c)/sqrt(M + c) is at most d and smooth.
 
-    For capsules the bound is below the distance by at most 0.84 e, and by at most e^2/d for cores (segments and boxes)
-    a distance d apart. Beside a mesh, a cylinder or a half-space it is at most 3 e below the unrounded result. For two
-    boxes it is at most 4 e below the largest of their gaps along 15 axes and of the distances of either one to the
-    bounding box of the other in its own axes. That is the distance itself for boxes that are aligned, overlap, or are
-    closest at a face or across two edges. Kinks are smoothed over a length of about e^2/d, so a fifth of the radii is a
-    good e and a hundredth has no effect. At d less than 2 e directions jump as without rounding. Spheres beside
-    spheres, capsules and boxes are smooth already and ignore the rounding.
+    For capsules the bound is below the distance by at most 0.84 e, and by at most e^2/d for cores a distance d apart.
+    Beside a mesh, a cylinder or a half-space it is at most 3 e below the unrounded result, for two boxes at most 4 e
+    below the largest of their gaps along 15 axes and of the distances of either one to the bounding box of the other in
+    its own axes. A fifth of the radii is a good e and a hundredth has no effect. Spheres beside spheres, capsules and
+    boxes are smooth already and ignore the rounding.
 
     Args:
         first, second: Shapes in world, or in the frames.
@@ -124,8 +122,8 @@ def distance(
 def column(shape: Shape, frame: Frame | None = None) -> Expression:
     """Return a sphere, capsule, box or half-space in the world as the column of numbers that `pair_function` takes.
 
-    Sphere: position, radius. Capsule: start, end, radius. Box: position, its three axes, half of its edges. Half-space:
-    point, normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
+    Sphere: position, radius. Capsule: start, end, radius. Box: position, axes, half of its edges. Half-space: point,
+    normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
 
     Raises:
         ModelError: The shape is a mesh or a cylinder, which have no column, or is invalid for `distance`.
@@ -166,16 +164,9 @@ def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, coun
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
-    twist - second twist), with twists (angular, linear at the world's origin). The closest points slide along the
-    shapes without changing the distance, so only the positions of the shapes are differentiated (envelope theorem). All
-    pairs are evaluated by vectorised operations, several times faster in an interpreter than one pair after the other.
-
-    Args:
-        first, second, rounding: As for `pair_function`.
-        count: Number of pairs n.
-
-    Raises:
-        ModelError: As for `pair_function`.
+    twist - second twist), with twists (angular, linear at the world's origin). Closest points slide along the shapes
+    without changing the distance, so only the positions of the shapes are differentiated (envelope theorem). Arguments
+    and errors are those of `pair_function`.
     """
     pair_function(first, second, rounding)
     return _pair_wrenches((first, second), float(rounding), count)
@@ -252,6 +243,27 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
             raise ModelError(message, name="values", value=value.shape, limit=(1, 1))
     stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
+
+
+def soft_minima(
+    value: Expression, gradient: Expression, positions: list[int], counts: list[int], *, softness: float
+) -> tuple[Expression, Expression]:
+    """Return the soft minimum of the distances in each group, and its gradient.
+
+    The distances of the groups, `counts` each, are at the rows `positions` of `value` and `gradient`.
+    """
+    values, rows, order = [value], [gradient], []
+    for begin, end in pairwise(accumulate(counts, initial=0)):
+        members = positions[begin:end]
+        if len(members) == 1:
+            order += members
+            continue
+        group = value[members]
+        weights = ca.exp((ca.mmin(group) - group) / softness)
+        order.append(len(positions) + len(values) - 1)
+        values.append(soft_minimum(ca.vertsplit(group), softness))
+        rows.append(ca.mtimes((weights / ca.sum1(weights)).T, gradient[members, :]))
+    return ca.vertcat(*values)[order], ca.vertcat(*rows)[order, :]
 
 
 def _check_kind(kind: Any, what: str) -> None:
@@ -355,10 +367,10 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
 
 
 def _edge_directions(hull: Hull) -> Array:
-    """Return the bisectors of the normals of faces that meet at a sharp edge or corner of a hull. Shape (k, 3).
+    """Return the bisectors, (k, 3), of the normals of faces that meet at a sharp edge or corner of a hull.
 
     All normals at a sharp edge or corner differ by more than pi/4. Beyond an edge whose faces' normals differ by an
-    angle a, the normals alone see at most cos(a/2) of a distance, 92 % at pi/4.
+    angle a, the normals alone see at most cos(a/2) of a distance.
     """
     a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
     face = (np.cross(b - a, c - a) @ hull.normals.T).argmax(axis=1)

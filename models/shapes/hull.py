@@ -1,10 +1,8 @@
 """Convex hulls of points, and the closest points of pairs of convex hulls.
 
-`convex_hull` computes one hull with its vertices, triangles and face planes. `nearest_directions` computes the closest
-points of many pairs of hulls at once. Pairs of points and segments, and pairs of one of these and a box, are solved in
-closed form. Other pairs are solved by the algorithm of Gilbert, Johnson and Keerthi (1988), which searches the
-Minkowski difference for its point nearest to the origin. The gap along any direction (`gap_along`) is a lower bound of
-the distance, so a result can be verified without trusting the search.
+`nearest_directions` computes the closest points of many pairs of hulls at once: of segments and boxes in closed form,
+of others by the algorithm of Gilbert, Johnson and Keerthi (1988). The gap along any direction (`gap_along`) is a lower
+bound of the distance, so a result can be verified without trusting the search.
 """
 
 from __future__ import annotations
@@ -30,29 +28,18 @@ EDGE_I, EDGE_J = np.triu_indices(3, 1)
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull of points in space: its vertices, triangles and face planes.
+    """A convex hull of points in space: its vertices, triangles and face planes."""
 
-    Attributes:
-        vertices: Corners of the hull. Shape (m, 3), m.
-        faces: Triangles of corners, counter-clockwise from outside. Shape (k, 3).
-        normals: Distinct outward unit normals of the faces. Shape (f, 3).
-        offsets: The hull is the set of x with normals x <= offsets. Shape (f,), m.
-    """
-
-    vertices: Array
-    faces: NDArray[np.intp]
-    normals: Array
-    offsets: Array
+    vertices: Array  # corners of the hull. Shape (m, 3), m.
+    faces: NDArray[np.intp]  # triangles of corners, counter-clockwise from outside. Shape (k, 3).
+    normals: Array  # distinct outward unit normals of the faces. Shape (f, 3).
+    offsets: Array  # the hull is the set of x with normals x <= offsets. Shape (f,), m.
 
 
 def convex_hull(points: Array) -> Hull:
-    """Return the convex hull of points, computed by qhull (Barber, Dobkin & Huhdanpaa 1996).
+    """Return the convex hull of points, shape (n, 3), m, computed by qhull (Barber, Dobkin & Huhdanpaa 1996).
 
-    Qhull takes seconds for several hundred thousand points and cannot be interrupted. It runs in its own thread, so
-    that Ctrl-C ends the wait for it at once.
-
-    Args:
-        points: Shape (n, 3), m.
+    Qhull cannot be interrupted. It runs in its own thread, so that Ctrl-C ends the wait for it at once.
 
     Raises:
         ModelError: The points are coplanar, collinear or coincident.
@@ -126,14 +113,9 @@ def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the gaps between K pairs of hulls along unit vectors that point from the first hull to the second.
+    """Return the gaps, (K,), m, between K pairs of hulls along unit vectors (K, 3) from the first hull to the second.
 
-    Args:
-        direction: Shape (K, 3).
-        first, second: Points of the hulls. Shapes (K, m, 3), (K, l, 3), m.
-
-    Returns:
-        Signed gaps, lower bounds of the distances. Shape (K,), m.
+    The hulls are given by points, shapes (K, m, 3) and (K, l, 3). A gap is a lower bound of the distance.
     """
     column = direction[:, :, None]
     return np.asarray((second @ column).min(axis=(1, 2)) - (first @ column).max(axis=(1, 2)))
@@ -167,15 +149,8 @@ def nearest_directions(
         overlap, the vector is the direction of least overlap among the candidate axes, which are complete for segments
         and boxes, and the two points coincide inside both hulls.
     """
-    if first.shape[1] == 1 and (boxes[1] or second.shape[1] == 1):
-        on_first, on_second, difference = _point_beside_box(first, second)
-    elif second.shape[1] == 1 and boxes[0]:
-        on_second, on_first, difference = _point_beside_box(second, first)
-        difference = -difference
-    elif min(first.shape[1], second.shape[1]) == 1:
-        first, second = (np.repeat(p, 2, axis=1) if p.shape[1] == 1 else p for p in (first, second))
-        return nearest_directions(first, second, boxes)
-    elif first.shape[1] == second.shape[1] == 2:
+    first, second = (np.repeat(p, 2, axis=1) if p.shape[1] == 1 else p for p in (first, second))  # points as segments
+    if first.shape[1] == second.shape[1] == 2:
         on_first, on_second, difference = _between_segments(first, second)
     elif first.shape[1] == 2 and boxes[1]:
         on_first, on_second, difference = _segment_beside_box(first, second)
@@ -194,9 +169,9 @@ def nearest_directions(
 
 
 def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of segments, and the vectors between these points. Shape (K, 3) each.
+    """Return the closest points of K pairs of segments, (K, 2, 3), and the vectors between these points, (K, 3) each.
 
-    Segments have shape (K, 2, 3). Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
+    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
     """
     u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
     a, e, b = (u * u).sum(axis=1), (v * v).sum(axis=1), (u * v).sum(axis=1)
@@ -212,12 +187,11 @@ def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of a segment and a box, and the vectors between these points. Shape (K, 3)
-    each.
+    """Return the closest points of K pairs of a segment (K, 2, 3) and a box (K, 8, 3), and the vectors between these
+    points.
 
-    Segments have shape (K, 2, 3), corners of boxes (K, 8, 3). Half the derivative of the squared distance in the
-    position s along the segment is increasing and piecewise linear. It has its kinks where the segment enters or leaves
-    a slab of the box. It is evaluated at the kinks, between two of which its root is interpolated.
+    Half the derivative of the squared distance in the position s along the segment is increasing and piecewise linear,
+    with kinks where the segment enters or leaves a slab of the box. Its root is interpolated between two kinks.
     """
     centre = (box[:, 0] + box[:, 7]) / 2
     axes = box[:, [4, 2, 1]] - box[:, :1]
@@ -240,20 +214,6 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
     nearest = np.clip(x, -half, half)
     on_first, on_second, difference = ((part[:, None] @ axes)[:, 0] for part in (x, nearest, nearest - x))
     return on_first + centre, on_second + centre, difference
-
-
-def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of a point and a box (or a second point), and the vectors between them."""
-    on_point = point[:, 0]
-    if box.shape[1] == 1:
-        return on_point, box[:, 0], box[:, 0] - on_point
-    centre = (box[:, 0] + box[:, 7]) / 2
-    axes = (box[:, [4, 2, 1]] - box[:, :1]) / 2
-    offset = on_point - centre
-    shares = (axes @ offset[:, :, None])[:, :, 0] / (axes * axes).sum(axis=2)
-    beyond = shares - np.clip(shares, -1.0, 1.0)
-    difference = -(beyond[:, None] @ axes)[:, 0]
-    return on_point, on_point + difference, difference
 
 
 def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -296,9 +256,10 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each of K tetrahedra, the barycentric weights of the point nearest to the origin, and this point.
+    """Return, for each of K tetrahedra (K, 4, 3), the barycentric weights of the point nearest to the origin, and this
+    point.
 
-    Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
+    The vertices may coincide. Only faces that contain the last vertex are tried.
     """
     last = w[:, 3]
     edges = w[:, :3] - last[:, None]
@@ -339,10 +300,10 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Return unit vectors from the first hull to the second along which overlapping hulls overlap least. Shape (K, 3).
+    """Return unit vectors, (K, 3), from the first hull to the second along which overlapping hulls overlap least.
 
-    Candidates are the line between the centroids, the edges of both hulls, their cross products and the coordinate
-    axes. The edges of a hull are those from its first point to the next three; of a box, those from its first corner.
+    Candidates are the line between the centroids, the edges of both hulls from their first points, the cross products
+    of these, and the coordinate axes.
     """
     ends = [[1, 2, 4] if box else [1, 2, 3][: p.shape[1] - 1] for p, box in zip((first, second), boxes, strict=True)]
     edges = np.concatenate([p[:, indices] - p[:, :1] for p, indices in zip((first, second), ends, strict=True)], axis=1)

@@ -47,23 +47,14 @@ MARGIN_M = 1e-6
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Limits of the computing effort to prove that a pair of bodies need not be checked for collision.
+    """Limits of the computing effort to prove that a pair of bodies need not be checked for collision."""
 
-    Attributes:
-        first_configurations: Random configurations that are tried before a proof.
-        boxes: Boxes of joint positions that a proof may use with up to three joints between the bodies.
-        rounds: Bisections of the boxes.
-        grid: Steps of each of two joints between meshes.
-        refinements: Rounds of finer grids.
-        refined_points: Grid points of smallest distance that a finer grid surrounds.
-    """
-
-    first_configurations: int = 24
-    boxes: int = 2000
-    rounds: int = 40
-    grid: int = 24
-    refinements: int = 3
-    refined_points: int = 8
+    first_configurations: int = 24  # random configurations that are tried before a proof
+    boxes: int = 2000  # boxes of joint positions that a proof may use with up to three joints between the bodies
+    rounds: int = 40  # bisections of the boxes
+    grid: int = 24  # steps of each of two joints between meshes
+    refinements: int = 3  # rounds of finer grids
+    refined_points: int = 8  # grid points of smallest distance that a finer grid surrounds
 
 
 SETTINGS = ProofSettings()
@@ -235,17 +226,11 @@ Poses: TypeAlias = tuple[Array, Array]
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies: its entry in the joint vector, and the bodies' largest distance from its axis.
+    """A moving joint between two bodies, with its entry in the joint vector."""
 
-    Attributes:
-        column: Index in the joint vector.
-        ratio: Velocity of the joint over that of the entry.
-        arm: Largest distance of the points of one of the bodies from the joint axis, m; 0 for a prismatic joint.
-    """
-
-    column: int
-    ratio: float
-    arm: float
+    column: int  # index in the joint vector
+    ratio: float  # velocity of the joint over that of the entry
+    arm: float  # largest distance of the points of one of the bodies from the joint axis, m; 0 for a prismatic joint
 
     def distance_change(self, half: Array) -> Array:
         """Return the largest change of two bodies' distance if the joint moves by up to `half`, rad or m."""
@@ -265,14 +250,13 @@ class _PairClassifier:
     margin: float
     _by_hulls: dict[tuple[int, int], Reason | None] = field(default_factory=dict)
     _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
-    _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why two bodies need no collision check, or None if they need one; and whether hulls contradict covers.
+        """Return why two bodies need no collision check, or None; and whether covers of meshes always collide but hulls
+        do not.
 
-        The second result tells whether the covers of the pair always collide but the hulls do not. Covers of meshes
-        protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are therefore classified
-        by the convex hulls of meshes.
+        Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
+        therefore classified by the convex hulls of meshes.
         """
         pair = self._pair(first.link, first.shape, second.link, second.shape)
         overhang = first.overhang + second.overhang
@@ -298,9 +282,7 @@ class _PairClassifier:
     def _pair(self, first_link: str, first: Shape, second_link: str, second: Shape) -> _BodyPair:
         parts = self.parts
         up, down = parts.path(parts.of_link[first_link], parts.of_link[second_link])
-        poses = [self._pose(parts.of_link[link]) for link in (first_link, second_link)]
-        bodies = self._place(first_link, first), self._place(second_link, second)
-        return _BodyPair(self.robot, *bodies, up, down, _relative_poses(*poses))
+        return _BodyPair(self.robot, self._place(first_link, first), self._place(second_link, second), up, down)
 
     def _place(self, link: str, shape: Shape) -> _PlacedBody:
         """Return a shape of a link in the frame of the rigid part that contains the link."""
@@ -308,15 +290,6 @@ class _PairClassifier:
         if key not in self._placed:
             self._placed[key] = _PlacedBody(shape.placed(*self.parts.pose[link]))
         return self._placed[key]
-
-    def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part relative to the root link in the first random configurations."""
-        if part not in self._poses:
-            q = self.configurations[: SETTINGS.first_configurations]
-            step = self.parts.step.get(part)
-            origin = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
-            self._poses[part] = origin if step is None else _poses_below(self.robot, self._pose(step.above), step, q)
-        return self._poses[part]
 
 
 class _PlacedBody:
@@ -330,18 +303,17 @@ class _PlacedBody:
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies, the joints between their rigid parts, and the parts' relative poses at random configurations."""
+    """Two bodies and the joints between their rigid parts, up and then down the tree."""
 
     robot: Robot
     first: _PlacedBody
     second: _PlacedBody
     up: list[JointStep]
     down: list[JointStep]
-    start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
         """Return why two bodies need no collision check (they collide always or never), or None if they need one."""
-        colliding = self.bounds_at(self.start)[0] <= 0
+        colliding = self.bounds(configurations[: SETTINGS.first_configurations])[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
             if largest <= 0:
@@ -349,9 +321,8 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER (no collision) if two hulls are apart at all points of ever finer grids of joint positions.
-
-        Returns ALWAYS for hulls that overlap on the whole first grid, else None.
+        """Return NEVER if two hulls are apart on ever finer grids of joint positions, ALWAYS if they overlap on the
+        first grid.
         """
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         start = np.where(np.isfinite(low), low, -np.pi)[columns]
@@ -371,17 +342,12 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of two bodies' distance at joint vectors, m, and whether bounding balls were not enough.
-
-        Joint vectors have shape (k, dof). Bounding balls suffice where they prove a distance greater than `above`, m.
-        """
-        return self.bounds_at(self._relative(q), above)
-
-    def bounds_at(self, poses: Poses, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of two bodies' distance for relative poses, m, and whether bounding balls were not
+        """Return lower bounds of two bodies' distance at joint vectors (k, dof), m, and whether bounding balls were not
         enough.
+
+        Bounding balls suffice where they prove a distance greater than `above`, m.
         """
-        (turn, shift), first, second = poses, self.first, self.second
+        (turn, shift), first, second = self._relative(q), self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
         close: NDArray[np.bool_] = np.asarray(bounds <= above + MARGIN_M)
         if close.any():
@@ -406,7 +372,8 @@ class _BodyPair:
             first = _poses_below(self.robot, first, step, q)
         for step in self.down:
             second = _poses_below(self.robot, second, step, q)
-        return _relative_poses(first, second)
+        back = first[0].transpose(0, 2, 1)
+        return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
         """Return whether bisection of the joint space proves that two bodies stay farther apart than `margin`, m."""
@@ -475,9 +442,3 @@ def _poses_below(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses
     if step.joint.kind == "prismatic":
         return turn, shift + position[:, None] * (turn @ step.joint.axis)
     return turn @ rotation_matrices(position[:, None] * step.joint.axis), shift
-
-
-def _relative_poses(first: Poses, second: Poses) -> Poses:
-    """Return the poses of a second rigid part in the frame of a first, from the poses of both."""
-    back = first[0].transpose(0, 2, 1)
-    return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]

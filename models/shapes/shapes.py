@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, freeze, require
+from models.checks import Array, ArrayInput, freeze, require, set_fields
 from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
 from models.spatial import Expression, Frame, expand_tables, expression
@@ -41,7 +41,7 @@ class _SweptCore:
     @property
     def core(self) -> Array:
         """Points whose convex hull is the core of the shape. Shape (m, 3), m."""
-        raise NotImplementedError
+        return np.array([getattr(self, name) for name in self.POINTS])
 
     @property
     def swept_radius(self) -> float:
@@ -55,13 +55,27 @@ class _SweptCore:
         own = copy(self)  # shares the hull, which is costly to compute
         for name in (*self.POINTS, *self.AXES):
             moved = turn @ getattr(self, name)
-            object.__setattr__(own, name, freeze(moved + shift if name in self.POINTS else moved))
+            set_fields(own, **{name: freeze(moved + shift if name in self.POINTS else moved)})
         return own
 
     def reach(self, point: ArrayInput) -> float:
         """Return the largest distance of the shape's points from a given point (3,), m; inf for an unbounded shape."""
         centre = require.array("shape: point", point, (3,))
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
+
+
+class _Polytope(_SweptCore):
+    """A convex polytope at a pose of its own, given by its hull."""
+
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
+    position: ArrayInput
+    rotation: ArrayInput
+    hull: Any
+
+    @property
+    def core(self) -> Array:
+        """Vertices of the convex hull in the frame of the shape. Shape (m, 3), m."""
+        return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +94,8 @@ class Sphere(_SweptCore):
     position: ArrayInput = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", require.positive("sphere: radius", self.radius, unit="m"))
-        object.__setattr__(self, "position", _checked_position(self.position, "sphere"))
-
-    @property
-    def core(self) -> Array:
-        """Centre of the sphere, as an array of one point. Shape (1, 3), m."""
-        return np.array([self.position])
+        set_fields(self, radius=require.positive("sphere: radius", self.radius, unit="m"))
+        set_fields(self, position=_checked_position(self.position, "sphere"))
 
     @property
     def swept_radius(self) -> float:
@@ -112,17 +121,12 @@ class Capsule(_SweptCore):
     POINTS: ClassVar[tuple[str, ...]] = ("start", "end")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", require.nonnegative("capsule: radius", self.radius, unit="m"))
+        set_fields(self, radius=require.nonnegative("capsule: radius", self.radius, unit="m"))
         for name in ("start", "end"):
-            object.__setattr__(self, name, require.array(f"capsule: {name}", getattr(self, name), (3,)))
+            set_fields(self, **{name: require.array(f"capsule: {name}", getattr(self, name), (3,))})
         if self.radius == 0 and (self.start == self.end).all():
             message = "capsule: radius and length are zero; give a positive radius or two different ends"
             raise ModelError(message, name="radius", value=0.0, limit=0.0)
-
-    @property
-    def core(self) -> Array:
-        """Ends of the capsule's segment. Shape (2, 3), m."""
-        return np.array([self.start, self.end])
 
     @property
     def swept_radius(self) -> float:
@@ -131,7 +135,7 @@ class Capsule(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_SweptCore):
+class Cylinder(_Polytope):
     """A solid cylinder about its own z axis.
 
     Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
@@ -152,19 +156,13 @@ class Cylinder(_SweptCore):
     length: float
     position: ArrayInput = None
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
-    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         for name in ("radius", "length"):
             size = require.positive(f"cylinder: {name}", getattr(self, name), unit="m")
-            object.__setattr__(self, name, size)
-        object.__setattr__(self, "position", _checked_position(self.position, "cylinder"))
-        object.__setattr__(self, "rotation", require.rotation("cylinder: rotation", self.rotation))
-
-    @property
-    def core(self) -> Array:
-        """Corners of the prism that represents the cylinder. Shape (2 SIDES, 3), m."""
-        return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
+            set_fields(self, **{name: size})
+        set_fields(self, position=_checked_position(self.position, "cylinder"))
+        set_fields(self, rotation=require.rotation("cylinder: rotation", self.rotation))
 
     @cached_property
     def hull(self) -> Hull:
@@ -197,18 +195,16 @@ class Box(_SweptCore):
 
     def __post_init__(self) -> None:
         size = require.array("box: size", self.size, (3,), unit="m", entries="numbers", sign="positive")
-        object.__setattr__(self, "size", size)
-        object.__setattr__(self, "position", _checked_position(self.position, "box"))
-        object.__setattr__(self, "rotation", require.rotation("box: rotation", self.rotation))
+        set_fields(self, size=size)
+        set_fields(self, position=_checked_position(self.position, "box"))
+        set_fields(self, rotation=require.rotation("box: rotation", self.rotation))
         if np.isinf(size).all():
             raise ModelError("box: every edge is infinite; there is no outside", name="size", value=size)
 
     @property
     def core(self) -> Array:
-        """Corners of the box, ordered along the z edge first, then y, then x. Shape (8, 3), m.
-
-        Raises:
-            ModelError: An edge is infinite.
+        """Corners of the box, ordered along the z edge first, then y, then x; ModelError for an infinite edge. Shape
+        (8, 3), m.
         """
         size = require.array("box: size", self.size, (3,), unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
@@ -240,13 +236,8 @@ class HalfSpace(_SweptCore):
         length = float(np.linalg.norm(normal))
         if not 0 < length < np.inf:
             raise ModelError(f"half-space: normal {normal.tolist()} has no direction", name="normal", value=normal)
-        object.__setattr__(self, "normal", freeze(np.asarray(normal / length)))
-        object.__setattr__(self, "point", _checked_position(self.point, "half-space", "point"))
-
-    @property
-    def core(self) -> Array:
-        """A point on the half-space's boundary plane. Shape (1, 3), m."""
-        return np.array([self.point])
+        set_fields(self, normal=freeze(np.asarray(normal / length)))
+        set_fields(self, point=_checked_position(self.point, "half-space", "point"))
 
     def reach(self, point: ArrayInput) -> float:
         """Return inf, because a half-space is unbounded."""
@@ -255,7 +246,7 @@ class HalfSpace(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(_SweptCore):
+class Mesh(_Polytope):
     """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
@@ -279,7 +270,6 @@ class Mesh(_SweptCore):
     file: str | Path | None = None
     scale: ArrayInput = 1.0
     hull: Hull = field(init=False, repr=False)
-    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         if self.file is not None:
@@ -290,26 +280,26 @@ class Mesh(_SweptCore):
             from models.shapes.mesh_files import read_mesh
 
             for name, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
-                object.__setattr__(self, name, value)
+                set_fields(self, **{name: value})
         elif self.vertices is None:
             raise ModelError("mesh: vertices are missing; give vertices or a file", name="vertices", value=None)
         vertices = require.array("mesh: vertices", self.vertices, ("vertices", 3), least=4)
-        object.__setattr__(self, "vertices", vertices)
+        set_fields(self, vertices=vertices)
         if self.faces is not None:
             faces = require.indices("mesh: faces", self.faces, len(vertices))
             if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
                 message = f"mesh: faces have shape {faces.shape}, expected (m, 3)"
                 raise ModelError(message, name="faces", value=self.faces, limit=("m", 3))
-            object.__setattr__(self, "faces", faces)
+            set_fields(self, faces=faces)
         scale = require.broadcast("mesh: scale", self.scale, 3, "axes")
         if not scale.all():
             message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
             raise ModelError(message, name="scale", value=scale, limit=0.0)
-        object.__setattr__(self, "scale", scale)
-        object.__setattr__(self, "position", _checked_position(self.position, "mesh"))
-        object.__setattr__(self, "rotation", require.rotation("mesh: rotation", self.rotation))
+        set_fields(self, scale=scale)
+        set_fields(self, position=_checked_position(self.position, "mesh"))
+        set_fields(self, rotation=require.rotation("mesh: rotation", self.rotation))
         used = vertices if self.faces is None else vertices[np.unique(self.faces)]
-        object.__setattr__(self, "hull", convex_hull(used * scale))
+        set_fields(self, hull=convex_hull(used * scale))
 
     @classmethod
     def around(cls, hull: Hull) -> Mesh:
@@ -317,13 +307,8 @@ class Mesh(_SweptCore):
         mesh = object.__new__(cls)
         fields = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
         for name, value in {**fields, "file": None, "scale": np.ones(3), "hull": hull}.items():
-            object.__setattr__(mesh, name, value)
+            set_fields(mesh, **{name: value})
         return mesh
-
-    @property
-    def core(self) -> Array:
-        """Vertices of the mesh's convex hull in the frame of the shape. Shape (m, 3), m."""
-        return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
@@ -407,7 +392,7 @@ class MovingObstacle:
                 )
                 raise ModelError(message, name=name, value=value.shape, limit=shape)
             parts.append(value)
-        object.__setattr__(self, "_at", ca.Function("moving", [time], [parts[1], parts[0]]))
+        set_fields(self, _at=ca.Function("moving", [time], [parts[1], parts[0]]))
         for name, part in zip(("position", "rotation"), parts, strict=True):
             if not ca.symvar(part):
                 require.array(f"moving: {name}", ca.DM(part).full(), part.shape)

@@ -26,11 +26,11 @@ from ocp.app.files import settings
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
 from ocp.app.files.settings import REQUIRED, Readers, TomlTable, joint_values, located_errors, rotation_of
 from ocp.app.files.waypoints import read_waypoints
+from ocp.motion.builders.dynamics import JointFriction
 from ocp.motion.builders.space.capture import Capture, Cone, Grasp
 from ocp.motion.builders.standing.problem import FreeTime, Weights
 from ocp.motion.builders.standing.stances import Steps, walk
 from ocp.motion.builders.standing.steps import StepWeights
-from ocp.motion.builders.torques import JointFriction
 from ocp.motion.result.margin import checked_uncertainty
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints

@@ -16,8 +16,7 @@ import numpy as np
 from models import ModelError
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, real
 from models.paths.blends import rest_to_rest
-from models.paths.functions import exponential, path_function, turn_function
-from models.paths.smooth_path import SmoothPath
+from models.paths.smooth_path import SmoothPath, exponential, path_function, turn_function
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import SpeedProfile

@@ -29,8 +29,7 @@ from ocp import (
     resolve,
     solve,
 )
-from ocp.app.check.data_checks import Fault
-from ocp.app.check.joint_limits import Motion
+from ocp.app.check.joint_limits import Fault, Motion
 from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
 from ocp.app.view.report import draw_curves
 from ocp.motion.local.rates import LocalSolution
