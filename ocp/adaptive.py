@@ -119,10 +119,11 @@ class AdaptiveProblem:
                 costs = [plan.cost for _, plan in found]
                 agree = len(found) > 1 and costs[1] - costs[0] <= LIMIT_SHARE * abs(costs[0])
                 if found and (agree or len({id(of) for of, _ in found}) > 1 or mesh is FIRST_MESHES[-1]):
+                    first, plan = found[0]
                     try:
-                        return self._refined(*found[0], parameters)
+                        return self._refined(first, plan, parameters)
                     except SolveError as error:
-                        ends.append(f"{_label(found[0][0])}, refined: {str(error).splitlines()[0]}")
+                        ends.append(f"{_label(first)}, refined: {str(error).splitlines()[0]}")
                         found.clear()
                 if time_left() <= 0:
                     break

@@ -160,15 +160,15 @@ def integrator(
         start, places: Initial time, and the times at which the integrator returns the states.
         tolerance: Relative and absolute tolerance of the local error. max_steps: Maximum number of steps between two
             places.
-        smooth: Use Adams formulas, for smooth dynamics that are not stiff, and no warning of a failed trial step; else
-            backward differentiation formulas.
+        smooth: Use Adams formulas, for smooth dynamics that are not stiff; else backward differentiation formulas.
     """
     options: dict[str, Any] = {
         "reltol": tolerance,
         "abstol": tolerance,
         "max_num_steps": max_steps,
         "quad_err_con": True,
+        "show_eval_warnings": False,  # of failed trial steps
+        "disable_internal_warnings": True,
+        "linear_multistep_method": "adams" if smooth else "bdf",
     }
-    if smooth:
-        options |= {"linear_multistep_method": "adams", "show_eval_warnings": False, "disable_internal_warnings": True}
     return ca.integrator(name, "cvodes", dae, start, list(places), options)

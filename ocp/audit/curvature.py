@@ -210,7 +210,10 @@ def _sweep_stages(
         cost = (cost + cost.T) / 2
         gains.append(_Gain(lift[m:], response))
     for curves in curved_stages.values():
-        smallest = np.linalg.eigvalsh(np.array([stage_hessian for _, stage_hessian in curves]))[:, 0] / scale
+        hessians = np.array([stage_hessian for _, stage_hessian in curves])
+        if not np.isfinite(hessians).all():  # stages before one that is not convex
+            return None
+        smallest = np.linalg.eigvalsh(hessians)[:, 0] / scale
         i = int(np.argmin(smallest))
         if not smallest[i] > FLAT_SHARE:
             return None
@@ -442,7 +445,7 @@ def _variation(
     states[n] = z
     cost += float(z @ sweep.end_cost @ z)
     violations.append(np.abs(sweep.end_rows @ z).max(initial=0.0))
-    size = max(float(np.abs(states).max()), float(np.abs(values).max()))
+    size = max(float(np.abs(states).max()), float(np.abs(values).max(initial=0.0)))
     length = float(np.sum(values**2) + (0.0 if start is None else start @ start))
     values /= np.repeat(sweep.metric, nu, axis=1)
     unscaled = values.reshape(n * q, nu) * accessory.range, states[:, : accessory.nx] * accessory.unit[: accessory.nx]

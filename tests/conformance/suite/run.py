@@ -16,6 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, RefinementSettings, Solution, refine, solve
@@ -172,14 +173,15 @@ def automatic(entry: Entry, cost: float) -> Row:
     """
     row: Row = {}
     for start in ("no guess", "guess"):
-        rows = _forked(AUTOMATIC_SECONDS + 5, lambda send, start=start: send(_automatic(entry, start == "no guess")))
+        rows = _forked(AUTOMATIC_SECONDS + 5, partial(_automatic, entry, start == "no guess"))
         row = rows[-1] if rows else {"automatic_failed": f"no plan within {AUTOMATIC_SECONDS} s of the processor"}
         row["automatic_start"] = start
         found = row.get("automatic_cost", math.nan)
-        row["automatic"] = "automatic_failed" not in row and reached(found, cost)
+        feasible = row.pop("automatic_feasible", False)
+        row["automatic"] = feasible and reached(found, cost)
         if row["automatic"]:
             break
-        row.setdefault("automatic_failed", f"cost {found:.8g}")
+        row.setdefault("automatic_failed", f"cost {found:.8g}" if feasible else f"not feasible, cost {found:.8g}")
     return row
 
 
@@ -188,17 +190,19 @@ def reached(found: float, cost: float) -> bool:
     return found - cost <= max(DEVIATION * abs(cost), 1e-9)
 
 
-def _automatic(entry: Entry, unguessed: bool) -> Row:
-    """Return cost, mesh and seconds of a solve without a method."""
+def _automatic(entry: Entry, unguessed: bool, send: Callable[[Row], None]) -> None:
+    """Send cost, mesh, seconds and feasibility of a solve without a method."""
     began = time.process_time()
     try:
         problem = without_guess(entry.build()) if unguessed else entry.build()
         with time_limited(AUTOMATIC_SECONDS, processor=True):
             plan = solve(problem)
-        row: Row = {"automatic_cost": plan.cost, "automatic_intervals": plan.method["intervals"]}
     except Exception as error:
-        row = {"automatic_failed": words(error)}
-    return row | {"automatic_seconds": time.process_time() - began}
+        send({"automatic_failed": words(error), "automatic_seconds": time.process_time() - began})
+        return
+    row: Row = {"automatic_cost": plan.cost, "automatic_intervals": plan.method["intervals"]}
+    row["automatic_seconds"] = time.process_time() - began
+    send(row | {"automatic_feasible": plan.audit(only_feasible=True).feasible})
 
 
 def without_guess(problem: Problem) -> Problem:

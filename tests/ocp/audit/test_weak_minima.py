@@ -118,3 +118,16 @@ def test_a_limit_with_a_small_multiplier_is_active_though_the_solver_leaves_a_ga
     assert 1e-4 < plan["u"][plan.t < 0.45].max() < 1e-2  # the gap
     audit = plan.audit()
     assert audit.passed, audit
+
+
+def test_a_stationary_start_of_a_problem_without_controls_that_is_no_minimum() -> None:
+    """cos x is stationary at x = 0, where it is greatest; x' = -x / 10 for 1 s."""
+    problem = Problem("start")
+    x = problem.state("x", lower=-2.0, upper=2.0, guess=0.0)
+    problem.horizon(1.0)
+    problem.dynamics(x, -x / 10)
+    problem.minimize(terminal=ca.cos(x))
+    summit = solve(problem, Collocation(4), check=False, options={"max_iter": 0})
+    audit = replace(summit, success=True).audit()
+    assert audit.feasible
+    assert audit.optimal is False
