@@ -111,20 +111,20 @@ class AdaptiveProblem:
         with time_limited(checked_time_limit(time_limit)), shown_progress(title, self.method.progress):
             ends: list[str] = []
             best: Solution | None = None
-            found: list[tuple[DirectMethod, Solution]] = []
+            plans: list[tuple[DirectMethod, Solution]] = []
             for mesh in FIRST_MESHES:
-                found += [(mesh, plan) for plan in self._first_plans(mesh, parameters, (guess, best), ends)]
-                found.sort(key=lambda pair: pair[1].cost)
-                best = found[0][1] if found else best
-                costs = [plan.cost for _, plan in found]
-                agree = len(found) > 1 and costs[1] - costs[0] <= LIMIT_SHARE * abs(costs[0])
-                if found and (agree or len({id(of) for of, _ in found}) > 1 or mesh is FIRST_MESHES[-1]):
-                    first, plan = found[0]
+                plans += [(mesh, plan) for plan in self._first_plans(mesh, parameters, (guess, best), ends)]
+                plans.sort(key=lambda pair: pair[1].cost)
+                best = plans[0][1] if plans else best
+                costs = [plan.cost for _, plan in plans]
+                agree = len(plans) > 1 and costs[1] - costs[0] <= LIMIT_SHARE * abs(costs[0])
+                if plans and (agree or len({id(of) for of, _ in plans}) > 1 or mesh is FIRST_MESHES[-1]):
+                    first, plan = plans[0]
                     try:
                         return self._refined(first, plan, parameters)
                     except SolveError as error:
                         ends.append(f"{_label(first)}, refined: {str(error).splitlines()[0]}")
-                        found.clear()
+                        plans.clear()
                 if time_left() <= 0:
                     break
             if best is not None:

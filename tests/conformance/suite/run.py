@@ -176,18 +176,18 @@ def automatic(entry: Entry, cost: float) -> Row:
         rows = _forked(AUTOMATIC_SECONDS + 5, partial(_automatic, entry, start == "no guess"))
         row = rows[-1] if rows else {"automatic_failed": f"no plan within {AUTOMATIC_SECONDS} s of the processor"}
         row["automatic_start"] = start
-        found = row.get("automatic_cost", math.nan)
+        own_cost = row.get("automatic_cost", math.nan)
         feasible = row.pop("automatic_feasible", False)
-        row["automatic"] = feasible and reached(found, cost)
+        row["automatic"] = feasible and reached(own_cost, cost)
         if row["automatic"]:
             break
-        row.setdefault("automatic_failed", f"cost {found:.8g}" if feasible else f"not feasible, cost {found:.8g}")
+        row.setdefault("automatic_failed", f"{'' if feasible else 'not feasible, '}cost {own_cost:.8g}")
     return row
 
 
-def reached(found: float, cost: float) -> bool:
+def reached(automatic_cost: float, cost: float) -> bool:
     """Return whether a cost is that of the row, or a lower one."""
-    return found - cost <= max(DEVIATION * abs(cost), 1e-9)
+    return automatic_cost - cost <= max(DEVIATION * abs(cost), 1e-9)
 
 
 def _automatic(entry: Entry, unguessed: bool, send: Callable[[Row], None]) -> None:
