@@ -1,10 +1,10 @@
 """Adaptive collocation: a problem is solved without a mesh and without a guess, to a requested accuracy of its cost.
 
 Coarse meshes forgive bad guesses: a nonlinear program of a few hundred variables has few stationary points, and its
-solution is the guess on the finer mesh. The first mesh on which the solver succeeds counts. It starts from the guess
-(without one: straight lines between fixed ends, the middle of bounds) and from the guess displaced by seeded random
-amounts, because the straight lines share the symmetries of a problem, along which a stationary plan may be a saddle.
-The plan of lower cost is refined.
+solution is the guess on the finer mesh. The solver starts from the guess (without one: straight lines between fixed
+ends, the middle of bounds) and from the guess displaced by seeded random amounts, because the straight lines share the
+symmetries of a problem, along which a stationary plan may be a saddle. Starts that end at different costs show several
+local minima. The plan of lowest cost is refined once two starts have found this cost, or two meshes have plans.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.refinement import RefinementSettings, refine
 from ocp.solution import ByName, Guess, Solution
-from ocp.tolerances import SOLVER_SHARE
+from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 FIRST_MESHES: tuple[DirectMethod, ...] = (
     Collocation(12), Collocation(20), MultipleShooting(40, steps=2), Collocation(40), Collocation(120, 4)
@@ -111,14 +111,20 @@ class AdaptiveProblem:
         with time_limited(checked_time_limit(time_limit)), shown_progress(title, self.method.progress):
             ends: list[str] = []
             best: Solution | None = None
+            plans: list[tuple[DirectMethod, Solution]] = []
             for mesh in FIRST_MESHES:
-                plan = self._first_plan(mesh, parameters, (guess, best), ends)
-                if plan is not None and plan.success:
-                    best = plan
+                plans += [(mesh, plan) for plan in self._first_plans(mesh, parameters, (guess, best), ends)]
+                plans.sort(key=lambda pair: pair[1].cost)
+                best = plans[0][1] if plans else best
+                costs = [plan.cost for _, plan in plans]
+                agree = len(plans) > 1 and costs[1] - costs[0] <= LIMIT_SHARE * abs(costs[0])
+                if plans and (agree or len({id(of) for of, _ in plans}) > 1 or mesh is FIRST_MESHES[-1]):
+                    first, plan = plans[0]
                     try:
-                        return self._refined(mesh, plan, parameters)
+                        return self._refined(first, plan, parameters)
                     except SolveError as error:
-                        ends.append(f"{_label(mesh)}, refined: {str(error).splitlines()[0]}")
+                        ends.append(f"{_label(first)}, refined: {str(error).splitlines()[0]}")
+                        plans.clear()
                 if time_left() <= 0:
                     break
             if best is not None:
@@ -151,10 +157,10 @@ class AdaptiveProblem:
         )
         return replace(result, start=plan.start)
 
-    def _first_plan(
+    def _first_plans(
         self, mesh: DirectMethod, parameters: ByName, guesses: tuple[Guess, Solution | None], ends: list[str]
-    ) -> Solution | None:
-        """Return the plan of lowest cost to which the starts on a first mesh lead; None if all of them fail.
+    ) -> list[Solution]:
+        """Return the plans to which the starts on a first mesh lead.
 
         ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
         """
@@ -175,7 +181,7 @@ class AdaptiveProblem:
                 plans.append(_descended(prepared, plan))
             elif time_left() <= 0:
                 break
-        return min(plans, key=lambda plan: plan.cost, default=None)
+        return plans
 
     def _failure(self, cause: SolveError, guess: Guess, ends: list[str]) -> SolveError:
         """Return the error that no first mesh has a plan, with the conflicting constraints that a last solve found."""

@@ -150,14 +150,15 @@ def integrator(
     ``dae`` is casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too. ``start`` is the
     initial time, and ``places`` are the times at which the integrator returns the states, with at most ``max_steps``
     steps between two of them. ``tolerance`` is that of the local error, relative and absolute. Adams formulas are used
-    for ``smooth`` dynamics that are not stiff, without a warning of a failed trial step, else backward differentiation.
+    for ``smooth`` dynamics that are not stiff, else backward differentiation formulas.
     """
     options: dict[str, Any] = {
         "reltol": tolerance,
         "abstol": tolerance,
         "max_num_steps": max_steps,
         "quad_err_con": True,
+        "show_eval_warnings": False,  # of failed trial steps
+        "disable_internal_warnings": True,
+        "linear_multistep_method": "adams" if smooth else "bdf",
     }
-    if smooth:
-        options |= {"linear_multistep_method": "adams", "show_eval_warnings": False, "disable_internal_warnings": True}
     return ca.integrator(name, "cvodes", dae, start, list(places), options)

@@ -166,12 +166,17 @@ def _refine_mesh(
     best: dict[str, float] = {}
     idle, late = 0, False
     moving, placed = isinstance(method, Collocation) and method.control == "points", np.zeros(0)
-    while True:
+
+    def assess() -> tuple[list[_Row], list[_Row]]:
+        """Record the errors of the last plan; return all rows, and those beyond their limits."""
         rows = _rows(form, p, solution, audit, tolerance, method)
-        beyond = [row for row in rows if not row.value <= 1.0]
         intervals.append(method.intervals)
         for kind, values in errors.items():
             values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+        return rows, [row for row in rows if not row.value <= 1.0]
+
+    while True:
+        rows, beyond = assess()
         nearer = [row for row in beyond if row.value < settings.nearer * best.get(row.name, np.inf)]
         best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
         idle = 0 if nearer else idle + 1
@@ -194,11 +199,7 @@ def _refine_mesh(
         solution, audit = result
     if beyond and not late and (tightened := _tightened(problem, method, (solution, audit), arguments, settings)):
         solution, audit = tightened
-        rows = _rows(form, p, solution, audit, tolerance, method)
-        beyond = [row for row in rows if not row.value <= 1.0]
-        intervals.append(method.intervals)
-        for kind, values in errors.items():
-            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+        _, beyond = assess()
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {settings.max_intervals} intervals"
     idles = idle == settings.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:

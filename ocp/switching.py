@@ -1,9 +1,9 @@
 """Switches of a plan: times at which a control, constraint or state reaches or leaves a limit, and nodes there.
 
 Minimum-time plans jump from limit to limit. A polynomial over an interval with such a jump oscillates beyond the limits
-on any mesh, and its cost is too high; with a node at the jump it is exact. :func:`switches` locates the jump from the
-plan itself: the integral of the control over the interval equals that of the arcs before and after it, each continued
-to the jump. Where a state reaches a limit, the control has the jump or the kink.
+on any mesh, and its cost is too high; with a node at the jump it is exact. :func:`locate_switches` finds the jump from
+the plan itself: the integral of the control over the interval equals that of the arcs before and after it, each
+continued to the jump. Where a state reaches a limit, the control has the jump or the kink.
 """
 
 from __future__ import annotations
@@ -63,18 +63,11 @@ class Switches(NamedTuple):
     smeared: np.ndarray
 
 
-def switches(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return the fractions of the horizon at which a limit becomes active or inactive. Shape (k,).
-
-    Args:
-        problem: The problem that was solved, by collocation with controls at the points.
-        solution: Its plan.
-    """
-    return locate_switches(problem, solution).fractions
-
-
 def locate_switches(problem: Problem, solution: Solution) -> Switches:
-    """Return the switches of a plan, see :func:`switches`, and the mesh intervals over which the plan smears them."""
+    """Return where limits of a plan become active or inactive, and the mesh intervals over which it smears them.
+
+    ``solution`` is a plan of ``problem`` by collocation with controls at the points.
+    """
     form = Formulation.of(problem)
     breaks, nodes = solution.control_interpolant.breaks, solution.control_interpolant.nodes
     n, width = len(breaks) - 1, np.diff(breaks)
@@ -194,7 +187,7 @@ def solve_at_switches(
     """
     previous = np.zeros(0)
     for iteration in range(SWITCHING.rounds):
-        located = switches(problem, plan)
+        located = locate_switches(problem, plan).fractions
         if len(located) == len(previous) and np.abs(located - previous).max(initial=0.0) < SWITCHING.same:
             break
         mesh = method.with_mesh(nodes_at_switches(method.fractions, located))

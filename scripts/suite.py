@@ -30,8 +30,8 @@ SIZE = (9.0, 9.0)
 
 
 def profile(path: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
-    """Share of the problems that a tool solves within a multiple of the least time of all tools."""
-    times = np.array([[_seconds(row, key) for key in TOOLS] for row in rows.values()])
+    """Share of the problems, tried by both, that a tool solves within a multiple of the least time of all tools."""
+    times = np.array([[_seconds(row, key) for key in TOOLS] for row in rows.values() if row["rockit_cost"]])
     times = times[np.isfinite(times).any(axis=1)]
     ratio = np.where(np.isfinite(times), times / np.nanmin(times, axis=1, keepdims=True), np.inf)
     note = "First solve on the same equal mesh from the same guess, with the time to pose it; of the processor."

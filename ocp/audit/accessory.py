@@ -150,11 +150,16 @@ class AccessoryProblem:
     def cost_scale(self) -> float:
         """Second-order change of the cost if states and controls change by their characteristic sizes.
 
-        In units of cost. For states only the running cost counts, for controls the Hamiltonian.
+        In units of cost. For states only the running and the terminal cost count, for controls the Hamiltonian.
         """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
-        return float(total) / 2
+        return float(total + np.abs(np.diag(self.along.final_yy)[:-1]) @ np.tile(sizes.state, 2) ** 2) / 2
+
+    @property
+    def negligible_cost(self) -> float:
+        """Cost below which a cost counts as zero: changes that a plan does not resolve reliably cost as much."""
+        return max(LIMIT_SHARE * self.cost_scale, LIMIT_SHARE**2 * self.along.slope_size)
 
     @property
     def control_scale(self) -> float:
@@ -187,6 +192,10 @@ class AccessoryProblem:
             return [multiplier_effect > FLAT_SHARE * (multiplier_effect.max(initial=0.0) or 1.0), near]
 
         strong, near = classify(along.control_limits, self.adjoint.control_multipliers[:, :nh], 0, control_sizes)
+        # a solver leaves a gap to a limit with a small multiplier, across which the Hamiltonian has one slope
+        gap = np.where(strong, along.control_limits.gap[:, :nh], 0.0)[:, :nu]
+        change = np.abs(np.einsum("kii->ki", self.curved)) * gap
+        near[:, :nu] |= strong[:, :nu] & (np.abs(self.adjoint.control_multipliers[:, :nu]) > change)
         self.fixed = strong[:, :nu] & near[:, :nu]
         pushed, state_active = classify(along.state_limits, self.adjoint.state_multipliers, nh, state_sizes)
         strong = np.hstack([strong & near | along.control_limits.equal[:nh], pushed | along.state_limits.equal])

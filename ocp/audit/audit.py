@@ -332,7 +332,7 @@ def optimality_findings(
         rows.append(Finding("condition of the free horizon, relative", optimum.adjoint.ends.horizon / errors, costates))
     second = optimum.curvature
     note = f"not decided: {second.flat}" if second.upwards is None else f"least {second.least:.3g} of the largest"
-    note = "convex problem: an extremal is a global optimum" if second.convex else note
+    note = second.proof or note
     downwards = 0.0 if second.upwards is not False else max(-second.least, FLAT_SHARE)
     limit = None if second.upwards is None or not share <= lost else 0.0
     rows.append(Finding("curvature downwards, relative", downwards, limit, second.time, note))

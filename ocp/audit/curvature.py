@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem, end_conditions
-from ocp.audit.principle import describe_singular_arcs, groups, is_convex
+from ocp.audit.principle import describe_singular_arcs, global_optimum, groups
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
@@ -53,7 +53,7 @@ class Curvature:
         gain: Cost that the controls could save in each interval by the best variation, if active constraints stay
             active and the states respond. Shape (N,).
         start_slope: Remaining gradient of the cost with respect to start and horizon. Shape (nz,).
-        convex: Whether the problem is convex, so that an extremal is a global optimum whatever the sweep finds.
+        proof: Why an extremal is a global optimum whatever the sweep finds, or "".
     """
 
     least: float
@@ -64,14 +64,14 @@ class Curvature:
     starts: tuple[np.ndarray, np.ndarray] | None = None
     gain: np.ndarray | None = None
     start_slope: np.ndarray | None = None
-    convex: bool = False
+    proof: str = ""
 
     @property
     def upwards(self) -> bool | None:
         """Whether the second variation is positive along all feasible variations; None if inconclusive."""
         if self.flat:
             return None
-        return self.convex or bool(self.least > FLAT_SHARE)
+        return bool(self.proof) or bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
         """Return the cost, to second order, that a change of start and horizon can save.
@@ -113,8 +113,8 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             if wider.least > FLAT_SHARE and not wider.flat:
                 result = wider
                 break
-    if result.flat and along.form.cached("convex", lambda: is_convex(along)):
-        return Curvature(result.least, result.time, "", None, along.t, *result[4:7], convex=True)
+    if result.flat and (proof := global_optimum(along, accessory.negligible_cost)):
+        return Curvature(result.least, result.time, "", None, along.t, *result[4:7], proof)
     flat = result.flat
     if flat:
         flat += describe_singular_arcs(along, accessory.adjoint.costate, accessory.linear_controls, accessory.moved)
@@ -210,7 +210,10 @@ def _sweep_stages(
         cost = (cost + cost.T) / 2
         gains.append(_Gain(lift[m:], response))
     for curves in curved_stages.values():
-        smallest = np.linalg.eigvalsh(np.array([stage_hessian for _, stage_hessian in curves]))[:, 0] / scale
+        hessians = np.array([stage_hessian for _, stage_hessian in curves])
+        if not np.isfinite(hessians).all():  # stages before one that is not convex
+            return None
+        smallest = np.linalg.eigvalsh(hessians)[:, 0] / scale
         i = int(np.argmin(smallest))
         if not smallest[i] > FLAT_SHARE:
             return None
@@ -442,7 +445,7 @@ def _variation(
     states[n] = z
     cost += float(z @ sweep.end_cost @ z)
     violations.append(np.abs(sweep.end_rows @ z).max(initial=0.0))
-    size = max(float(np.abs(states).max()), float(np.abs(values).max()))
+    size = max(float(np.abs(states).max()), float(np.abs(values).max(initial=0.0)))
     length = float(np.sum(values**2) + (0.0 if start is None else start @ start))
     values /= np.repeat(sweep.metric, nu, axis=1)
     unscaled = values.reshape(n * q, nu) * accessory.range, states[:, : accessory.nx] * accessory.unit[: accessory.nx]

@@ -215,7 +215,7 @@ class Linearisation:
         diagonal = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in constant.tolist()])
         curvature = self.share @ form.sampled([diagonal], *self.point, (lam, self.costate))[0]
         curvature = curvature + sum(np.diag(self.final_yy)[k] for k in (constant, nx + constant))
-        rates.append(np.sqrt(np.abs(curvature[None]) / 2 / (abs(self.solution.cost) or 1.0)))
+        rates.append(np.sqrt(np.abs(curvature[None]) / 2 / (max(abs(self.solution.cost), sizes.cost) or 1.0)))
         largest_rate = np.vstack(rates).max(axis=0)
         result = sizes.state.copy()
         with np.errstate(divide="ignore"):  # a state without an effect keeps its floor

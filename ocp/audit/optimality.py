@@ -20,7 +20,7 @@ from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import Adjoint, EndLimits, Ends, adjoint, end_limits, interval_end_costates
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Limits, Linearisation
-from ocp.audit.principle import Hamiltonian, control_loss, hamiltonian, reduced_slope, switching_loss
+from ocp.audit.principle import Hamiltonian, control_loss, hamiltonian, needle_loss, reduced_slope, switching_loss
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.solution import Solution
@@ -378,8 +378,7 @@ def optimality(
             first, loss = candidate, new_loss
     accessory = AccessoryProblem(along, first)
     spread = accessory.hamiltonian_scale
-    cost = max(abs(solution.cost), LIMIT_SHARE * accessory.cost_scale, LIMIT_SHARE**2 * along.slope_size)
-    cost = cost if cost > 0 else 1.0
+    cost = max(abs(solution.cost), accessory.negligible_cost) or 1.0
     total, best = _loss_by_interval(along, first, accessory.curved), first
     loss, costate_error = _total_loss(total, first), 0.0
     is_degenerate = along.may_be_degenerate or bool(accessory.linear_controls.any())
@@ -398,6 +397,7 @@ def optimality(
         additional = float(second_order.gain.sum() - total.sum())
         total += max(additional, 0.0) * second_order.gain / (float(second_order.gain.sum()) or 1.0)
     total[0] += second_order.lost(accessory.start_slope)
+    total = np.maximum(total, needle_loss(along, best.costate))
     return Optimality(
         total,
         cost,

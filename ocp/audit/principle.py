@@ -15,10 +15,15 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Linearisation
+from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
+from ocp.problem.intervals import Interval, check_instructions, evaluate
 from ocp.solution import Solution
 from ocp.solution_data import stack
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
+
+NEEDLES = 17
+"""Number of values of a control between its limits at which the Hamiltonian is compared."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,48 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
     running, products = form.sampled(lambda: [form.running, lam * form.f], *point, cache_as="Hamiltonian")
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
+
+
+def global_optimum(along: Linearisation, negligible: float) -> str:
+    """Return why an extremal of the problem is a global optimum, "" if that is unknown.
+
+    ``negligible`` is a cost that counts as zero.
+    """
+    if along.form.cached("convex", lambda: is_convex(along)):
+        return "convex problem: an extremal is a global optimum"
+    bound = cost_bound(along)
+    if along.solution.cost - bound <= LIMIT_SHARE * max(abs(along.solution.cost), negligible):
+        return f"global optimum: no plan within the bounds costs less by more than {along.solution.cost - bound:.2g}"
+    return ""
+
+
+def cost_bound(along: Linearisation) -> float:
+    """Return a lower bound of the cost of all plans within the bounds of states, controls and horizon.
+
+    It is the sum of the terminal cost's bound and the horizon times that of the running cost, by interval arithmetic on
+    all states and controls at once; -inf for operations without interval rules.
+    """
+    form, places = along.form, along.form.bounds.places
+    symbols = [form.x, form.u, form.T, form.x0, form.u0, form.t, form.p]
+    longest = along.bounds[1][places["horizon"]]
+
+    def bound(expression: Any, states: str) -> float:
+        function = ca.Function("cost", symbols, [ca.densify(expression)]).expand()
+        check_instructions("cost", function)
+        kinds = (states, "control", "horizon", "initial", "control")
+        sides = [
+            np.concatenate([*(side[places[kind]] for kind in kinds), time, along.p])
+            for side, time in zip(along.bounds, (np.zeros(1), longest), strict=True)
+        ]
+        parts = [ca.SX.sym("v", symbol.numel()) for symbol in symbols]
+        scalars = ca.Function("cost", ca.vertsplit(ca.vertcat(*parts)), function.call(parts))
+        return float(evaluate(scalars, [Interval(*ends) for ends in np.transpose(sides)[:, :, None]])[0].low[0])
+
+    try:
+        running, terminal = bound(form.running, "state"), bound(form.terminal, "terminal")
+    except (RuntimeError, NotImplementedError, ProblemError):  # signals, tables, operations without rules
+        return -np.inf
+    return terminal + running * float((along.bounds[0][places["horizon"]] if running >= 0 else longest)[0])
 
 
 def is_convex(along: Linearisation) -> bool:
@@ -338,6 +385,37 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
         active = blocked
     by_interval = ((by_gaps + gain) * along.share).reshape(n, -1).sum(axis=1)
     return np.asarray(by_interval + switching_loss(along, costate, curved_u))
+
+
+def needle_loss(along: Linearisation, costate: np.ndarray) -> np.ndarray:
+    """Return the cost, to first order, that needle variations of the controls save in each interval. Shape (N,).
+
+    It is the integral of H(u) - H(v), Weierstrass's excess, over the best v of a grid of admissible values of each
+    control. A plan may be a minimum among all with controls near its own and lose cost to these. The loss is zero
+    without a grid if the Hamiltonian is at most quadratic in the controls, where its curvature decides.
+    """
+    form, (n, q), mixed = along.form, along.shape, along.mixed
+    lam = form.sym("lam", form.nx)
+    total = along.scaled[0] + ca.dot(lam, along.scaled[1])
+    is_local = form.cached("local minimum", lambda: not ca.depends_on(ca.hessian(total, form.u)[0], form.u))
+    if is_local or along.control_limits_u.shape[1] > form.nu + mixed.size:  # arcs of the states restrict the controls
+        return np.zeros(n)
+    low = np.where(np.isfinite(along.low), along.low, along.u.min(axis=0) - along.control_size)
+    high = np.where(np.isfinite(along.high), along.high, along.u.max(axis=0) + along.control_size)
+    count = form.nu * NEEDLES
+    controls = np.tile(along.u, (count + 1, 1, 1))
+    for i, place in np.ndindex(form.nu, NEEDLES):
+        controls[1 + i * NEEDLES + place, :, i] = low[:, i] + (high - low)[:, i] * place / (NEEDLES - 1)
+    x, _, t, horizon, p, (fraction, s) = along.point
+    more = (fraction, np.tile(s, (count + 1, 1))), (lam, np.tile(costate, (count + 1, 1)))
+    point = np.tile(x, (count + 1, 1)), controls.reshape(-1, form.nu), np.tile(t, count + 1), horizon, p
+    values, rows = form.sampled(lambda: [total, along.scaled[2]], *point, *more, cache_as="excess")
+    values, rows = values.reshape(count + 1, n * q), rows.reshape(count + 1, n * q, -1)[:, :, mixed]
+    lower, upper = (side[form.bounds.places["path"][mixed]] for side in along.bounds)
+    allowed = LIMIT_SHARE * along.sizes.path[mixed]
+    admissible = ((rows >= lower - allowed) & (rows <= upper + allowed)).all(axis=2)
+    excess = np.where(admissible & np.isfinite(values), values[0] - values, 0.0).max(axis=0)
+    return np.asarray((excess * along.share).reshape(n, q).sum(axis=1))
 
 
 def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:

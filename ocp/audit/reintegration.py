@@ -22,9 +22,10 @@ from ocp.audit.correction import SETTINGS, IntegratedMotion, corrected_motion
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.sizes import FineGrid, integral, row_changes
 from ocp.console import check_time
-from ocp.curves import dormand_prince_step, newton_coefficients
+from ocp.curves import dormand_prince_step, integrator, newton_coefficients
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import evaluate_in_blocks
+from ocp.solution import Solution
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 
@@ -106,11 +107,52 @@ def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
     starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
     after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
     by_interval = after.reshape(n, cells, -1)
+    deviation = np.abs(by_interval[:, :, :-1] - grid.states.reshape(n, cells + 1, -1)[:, 1:]) / along.sizes.state
+    # steps that fail beside the plan are too long for stiff dynamics; a motion that diverges leaves the plan before
+    is_stiff = not np.isfinite(after).all() and not (deviation > 1.0).any()
+    if is_stiff and (motion := stiff_motion(along, starts, cells)) is not None:
+        return motion
     continuous = flow.integrate(np.zeros(n * cells, dtype=int), starts[:1], steps)[0].reshape(n, cells, -1)
     chained = np.vstack([starts[:1], continuous[:-1, -1, :-1]])
     motions = (starts, by_interval), (chained, continuous)
     local, states = (np.concatenate([start[:, None], values[:, :, :-1]], axis=1) for start, values in motions)
     return IntegratedMotion(local, states, float(by_interval[:, -1, -1].sum()), float(continuous[-1, -1, -1]))
+
+
+def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> IntegratedMotion | None:
+    """Return the motion that the controls of a plan produce by implicit steps, which stiffness does not limit.
+
+    They are the backward differentiation formulas of CVODES. None where they break down too.
+
+    Args:
+        along: The plan. starts: Its states at the start of every interval. Shape (N, nx).
+        cells: Number of cells of the fine grid in an interval.
+    """
+    form, curve, unit = along.form, along.solution.control_interpolant, along.sizes.state
+    horizon, sizes = along.solution.horizon, {"z": form.nx, "w": curve.values[0].size, "at": 1, "s": 1, "h": 1}
+    z, w, at, s, h = (ca.MX.sym(name, size) for name, size in sizes.items())
+    u = _newton_polynomial(ca.reshape(w, form.nu, len(curve.nodes)), curve.nodes, at)
+    function = form.function("f", [form.f, form.running], ["f", "running"])
+    rate, running = function(unit * z, u, (s + h * at) * horizon, horizon, along.p)
+    dae = {"x": z, "t": at, "p": ca.vertcat(w, s, h), "ode": h * horizon * rate / unit, "quad": h * horizon * running}
+    places = np.linspace(0.0, 1.0, cells + 1)[1:].tolist()
+    integrate = integrator("stiff", dae, places, tolerance=SETTINGS.tolerance, smooth=False)
+    data = _control_columns(along.solution)
+    motions: list[np.ndarray] = []
+    costs: list[float] = []
+    for chained in (False, True):
+        values, cost = np.empty((len(starts), cells + 1, form.nx)), 0.0
+        for k, inputs in enumerate(data):
+            values[k, 0] = values[k - 1, -1] if chained and k else starts[k]
+            try:
+                result = integrate(x0=values[k, 0] / unit, p=inputs)
+            except RuntimeError:
+                return None
+            values[k, 1:] = result["xf"].full().T * unit
+            cost += float(result["qf"][-1])
+        motions.append(values)
+        costs.append(cost)
+    return IntegratedMotion(motions[0], motions[1], costs[0], costs[1])
 
 
 def _worst(values: np.ndarray) -> np.ndarray:
@@ -150,8 +192,7 @@ class Flow:
     def __init__(self, along: Linearisation) -> None:
         form, solution, sizes = along.form, along.solution, along.sizes
         curve, self._inputs = solution.control_interpolant, np.append(along.p, solution.horizon)
-        differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
-        self._columns = np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
+        self._columns = _control_columns(solution)
         self._tolerance = SETTINGS.tolerance * np.append(sizes.state, sizes.cost)
         name = "steps", curve.nodes.tobytes()
         self._step = form.cached(name, lambda: step_function(form, curve.nodes).mapaccum("steps", SETTINGS.block))
@@ -239,13 +280,26 @@ def step_function(form: Formulation, nodes: np.ndarray) -> Any:
 
     def slope(within: float, state: Any) -> Any:
         at = place + within * width
-        u = differences[:, -1]
-        for i in range(len(nodes) - 2, -1, -1):
-            u = differences[:, i] + (at - nodes[i]) * u
+        u = _newton_polynomial(differences, nodes, at)
         return ca.vertcat(*function(state[: form.nx], u, (s + h * at) * horizon, horizon, p))
 
     after, error = dormand_prince_step(slope, ca.if_else(restart, start, x), h * width * horizon)
     return ca.Function("step", [x, data], [after, error], {"cse": True})
+
+
+def _control_columns(solution: Solution) -> np.ndarray:
+    """Return the divided differences of the controls in every interval, its start and its width. Shape (N, nw + 2)."""
+    curve = solution.control_interpolant
+    differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
+    return np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
+
+
+def _newton_polynomial(differences: Any, nodes: np.ndarray, at: Any) -> Any:
+    """Return the value at a position of the polynomial with given divided differences, one column a node."""
+    value = differences[:, -1]
+    for i in range(len(nodes) - 2, -1, -1):
+        value = differences[:, i] + (at - nodes[i]) * value
+    return value
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ocp import AdaptiveCollocation, Collocation, Problem, ProblemError, SolveError, prepare, solve
+from tests.conformance.suite import bryson_max_range
 from tests.ocp.direct.test_without_guess import reorientation
 from tests.ocp.problems import LogarithmicRegulator, double_integrator, plant
 
@@ -71,3 +72,10 @@ def test_the_error_without_a_plan_names_the_conflict_and_what_has_no_guess() -> 
 def test_invalid_settings_are_refused(arguments: dict[str, float]) -> None:
     with pytest.raises(ProblemError, match="AdaptiveCollocation"):
         AdaptiveCollocation(**arguments)  # type: ignore[arg-type]
+
+
+def test_the_lowest_of_several_local_minima_is_refined() -> None:
+    """On twelve intervals one start fails and the other ends in a poor local minimum; Bryson & Ho: range 1.7123."""
+    solution = solve(bryson_max_range.build())
+    assert solution.cost == pytest.approx(-1.712314, rel=1e-6)
+    assert solution.audit().passed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Problem, solve
-from ocp.switching import solve_at_switches, switches
+from ocp.switching import locate_switches, solve_at_switches
 
 
 def pushed(push: float = 1.0, brake: float = 3.0) -> Problem:
@@ -68,8 +68,8 @@ def test_limits_of_a_control_that_depend_on_the_state_switch_where_constant_ones
     problem.dynamics(speed, force)
     problem.minimize(terminal=horizon)
     plan = solve(problem, Collocation(7, 4))
-    assert switches(problem, plan) == pytest.approx([0.75], abs=2e-4)
-    assert switches(pushed(), solve(pushed(), Collocation(7, 4))) == pytest.approx([0.75], abs=2e-4)
+    assert locate_switches(problem, plan).fractions == pytest.approx([0.75], abs=2e-4)
+    assert locate_switches(pushed(), solve(pushed(), Collocation(7, 4))).fractions == pytest.approx([0.75], abs=2e-4)
 
 
 def test_a_plan_that_does_not_switch_stays_as_it_is() -> None:
@@ -80,5 +80,5 @@ def test_a_plan_that_does_not_switch_stays_as_it_is() -> None:
     problem.dynamics(speed, force - speed)
     problem.minimize(running=force**2)
     plan = solve(problem, method)
-    assert not switches(problem, plan).size
+    assert not locate_switches(problem, plan).fractions.size
     assert solve_at_switches(problem, method, plan) is plan

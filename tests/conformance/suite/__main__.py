@@ -1,9 +1,9 @@
 """All problems of the public suites, solved, audited, confirmed and timed: the table of results/suite.
 
-python -m tests.conformance.suite --out results/suite [--only NAME] [--minutes 60] [--again] [--plot]
+python -m tests.conformance.suite --out results/suite [--only NAME] [--minutes 60] [--again] [--automatic]
 
 A row is added to OUT/suite.csv as soon as its problem is done; a problem that is there is not done again, except, with
---again, where it was done by other code.
+--again, where it was done by other code. With --automatic only the solves without a method are done.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from tests.sweep.results import code_of
 
 from .entry import Entry
 from .library import entries
-from .run import Row, done, warm_up
+from .run import Row, automatic, done, warm_up
 
 TABLE = "suite.csv"
 COLUMNS = (
     "name", "suites", "verdict", "cost", "published", "exact", "digits", "second", "second_start", "feasible",
     "optimal", "reason", "method", "intervals", "first_cost", "seconds", "refined_seconds", "rockit_seconds",
-    "rockit_cost", "psopt_seconds", "failed", "code",
+    "rockit_cost", "psopt_seconds", "failed", "automatic", "automatic_start", "automatic_cost", "automatic_seconds",
+    "automatic_intervals", "automatic_failed", "automatic_code", "code",
 )  # fmt: skip
+AUTOMATIC = [name for name in COLUMNS if name.startswith("automatic")]
 PSOPT_SECONDS = {
     "bioreactor": 29.1, "brac1": 1.2, "breakwell": 44.1, "bryson_denham": 1.2, "bryson_max_range": 0.3, "catmix": 0.8,
     "chain": 1.3, "chance_constraint": 0.7, "chance_covariance": 4.6, "climb": 16.8, "conic_sdp": 0.4, "conic_soc": 0.6,
@@ -73,6 +75,16 @@ def row_of(entry: Entry) -> Row:
         "exact": "" if entry.exact is None else entry.exact,
         "psopt_seconds": PSOPT_SECONDS.get(entry.name, ""),
     }
+    return printed(row)
+
+
+def automatic_row_of(entry: Entry, row: Row) -> Row:
+    """The columns of a row about the solve without a method, done now."""
+    return printed({**dict.fromkeys(AUTOMATIC, ""), **automatic(entry, float(row.get("cost") or "nan"))})
+
+
+def printed(row: Row) -> Row:
+    """A row with its numbers as text."""
     short = {key for key in row if key.endswith("seconds") or key == "digits"}
     return {
         key: f"{value:{'.3g' if key in short else '.10g'}}" if isinstance(value, float) else value
@@ -87,15 +99,22 @@ def main() -> None:
     parser.add_argument("--only", choices=list(known), action="append", metavar="NAME")
     parser.add_argument("--minutes", type=float, default=90.0, help="after which no further problem is begun")
     parser.add_argument("--again", action="store_true", help="those whose rows are of other code once more")
+    parser.add_argument("--automatic", action="store_true", help="only the solves without a method")
     options = parser.parse_args()
     warm_up(known)
     code, rows, end = code_of(Path(__file__)), rows_of(options.out), time.time() + 60 * options.minutes
+    parts = [("automatic_code", automatic_row_of)]
+    if not options.automatic:
+        parts.insert(0, ("code", lambda entry, row: row_of(entry)))
     for name in options.only or known:
-        old = name not in rows or (rows[name]["code"] != code and (options.again or options.only))
-        if old and time.time() < end:
-            rows[name] = row_of(known[name]) | {"code": code}
-            write(options.out, rows)
-            print({key: value for key, value in rows[name].items() if value != ""}, flush=True)
+        for column, work in parts:
+            row = rows.get(name, {})
+            old = not row.get(column) or (row[column] != code and (options.again or options.only))
+            if old and time.time() < end:
+                done_now = {"name": name} | work(known[name], row) | {column: code}
+                rows[name] = row | done_now
+                write(options.out, rows)
+                print({key: value for key, value in done_now.items() if value != ""}, flush=True)
 
 
 if __name__ == "__main__":

@@ -11,12 +11,15 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "suite.md"
 MARKS = ("<!-- made by scripts/suite.py -->", "<!-- end -->")
 WORDS = {"True": "yes", "False": "no"}
 """Of verdicts of the audit."""
-HEAD = "| problem | cost | printed | verdict | digits | feasible | minimum | s | refined, s | rockit, s | PSOPT, s |"
+HEAD = (
+    "| problem | cost | printed | verdict | digits | feasible | minimum | s | refined, s | rockit, s | PSOPT, s "
+    "| automatic, s |"
+)
 
 
 def table(rows: Mapping[str, Mapping[str, str]]) -> str:
     """The rows as Markdown."""
-    lines = [HEAD, "|---|---:|---:|---|---:|---|---|---:|---:|---:|---:|"]
+    lines = [HEAD, "|---|---:|---:|---|---:|---|---|---:|---:|---:|---:|---:|"]
     for name, row in rows.items():
         rockit = row["rockit_seconds"] if row["rockit_cost"].lstrip("-")[:1].isdigit() else ""
         times = (row["seconds"], row["refined_seconds"], rockit, row["psopt_seconds"])
@@ -29,11 +32,21 @@ def table(rows: Mapping[str, Mapping[str, str]]) -> str:
             WORDS.get(row["feasible"], "-"),
             WORDS.get(row["optimal"], "undetermined" if row["feasible"] else "-"),
             *(f"{float(seconds):.2g}" if seconds else "-" for seconds in times),
+            automatic(row),
         )
         lines.append(f"| {' | '.join(cells)} |")
     missing = [name for name in entries() if name not in rows]
     lines += [f"| {name} |{' - |' * HEAD.count(' |')}".removesuffix(" - |") for name in missing]
     return "\n".join(lines)
+
+
+def automatic(row: Mapping[str, str]) -> str:
+    """Seconds of the solve without a method, with the guess that it needed; "no" where it misses the cost."""
+    if not row["automatic"]:
+        return "-"
+    if row["automatic"] != "True":
+        return "no"
+    return f"{float(row['automatic_seconds']):.2g}" + " (guess)" * (row["automatic_start"] == "guess")
 
 
 def write_page(page: Path, rows: Mapping[str, Mapping[str, str]]) -> None:

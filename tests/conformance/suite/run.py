@@ -15,9 +15,12 @@ import resource
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, RefinementSettings, Solution, refine, solve
+from ocp.console import time_limited
 
 from .entry import Entry, Method
 
@@ -27,6 +30,8 @@ FINER = 4
 """How many times as many intervals as the given mesh a refined one may have."""
 DEVIATION = 1e-4
 """Relative deviation from a printed cost that counts as agreement, if its digits promise no less."""
+AUTOMATIC_SECONDS = 60
+"""Limit of the processor time of one solve without a method, s."""
 SHARE = 0.1
 """Of a deviation from a printed cost, the most by which two methods may differ that confirm it."""
 Row = dict[str, Any]
@@ -157,19 +162,74 @@ def warm_up(known: Mapping[str, Entry]) -> None:
 
 def done(entry: Entry) -> Row:
     """All stages of a problem, in a process of its own."""
+    rows = _forked(MOST_SECONDS, lambda send: _stages(entry, send))
+    return rows[-1] if rows else {"failed": f"no plan within {MOST_SECONDS} s of the processor"}
+
+
+def automatic(entry: Entry, cost: float) -> Row:
+    """Solve a problem without a method: without any guess and, if that fails, with the guess of its source.
+
+    ``cost`` is the cost of the row, which the automatic plan has to reach.
+    """
+    row: Row = {}
+    for start in ("no guess", "guess"):
+        rows = _forked(AUTOMATIC_SECONDS + 5, partial(_automatic, entry, start == "no guess"))
+        row = rows[-1] if rows else {"automatic_failed": f"no plan within {AUTOMATIC_SECONDS} s of the processor"}
+        row["automatic_start"] = start
+        own_cost = row.get("automatic_cost", math.nan)
+        feasible = row.pop("automatic_feasible", False)
+        row["automatic"] = feasible and reached(own_cost, cost)
+        if row["automatic"]:
+            break
+        row.setdefault("automatic_failed", f"{'' if feasible else 'not feasible, '}cost {own_cost:.8g}")
+    return row
+
+
+def reached(automatic_cost: float, cost: float) -> bool:
+    """Return whether a cost is that of the row, or a lower one."""
+    return automatic_cost - cost <= max(DEVIATION * abs(cost), 1e-9)
+
+
+def _automatic(entry: Entry, unguessed: bool, send: Callable[[Row], None]) -> None:
+    """Send cost, mesh, seconds and feasibility of a solve without a method."""
+    began = time.process_time()
+    try:
+        problem = without_guess(entry.build()) if unguessed else entry.build()
+        with time_limited(AUTOMATIC_SECONDS, processor=True):
+            plan = solve(problem)
+    except Exception as error:
+        send({"automatic_failed": words(error), "automatic_seconds": time.process_time() - began})
+        return
+    row: Row = {"automatic_cost": plan.cost, "automatic_intervals": plan.method["intervals"]}
+    row["automatic_seconds"] = time.process_time() - began
+    send(row | {"automatic_feasible": plan.audit(only_feasible=True).feasible})
+
+
+def without_guess(problem: Problem) -> Problem:
+    """Return a problem without the guesses that it declares."""
+    declared = problem.declared
+    for pool in (declared.states, declared.controls):
+        for name, variable in pool.items():
+            pool[name] = replace(variable, guess=None)
+    if declared.horizon is not None:
+        declared.horizon.guess = None
+    return problem
+
+
+def _forked(seconds: int, work: Callable[[Callable[[Row], None]], None]) -> list[Row]:
+    """Return what work in a process of its own sends within a limit of the processor time, s."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS + 5))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
         with os.fdopen(writer, "w") as sink:
-            _stages(entry, lambda row: print(json.dumps(row), file=sink, flush=True))
+            work(lambda row: print(json.dumps(row), file=sink, flush=True))
         os._exit(0)
     os.close(writer)
     with os.fdopen(reader) as source:
         lines = source.read().splitlines()
     os.waitpid(child, 0)
-    rows = [json.loads(line) for line in lines if line.endswith("}")]
-    return rows[-1] if rows else {"failed": f"no plan within {MOST_SECONDS} s of the processor"}
+    return [json.loads(line) for line in lines if line.endswith("}")]
 
 
 def _stages(entry: Entry, send: Callable[[Row], None]) -> None:

@@ -13,7 +13,7 @@ from .__main__ import COLUMNS, PSOPT_SECONDS, rows_of
 from .entry import COPS, PSOPT, TOOLBOX
 from .library import EXCLUDED, SAME, entries
 from .page import PAGE, table
-from .run import digits, last_digit, verdict
+from .run import digits, last_digit, reached, verdict, without_guess
 
 ROOT = Path(__file__).resolve().parents[3]
 ROWS = rows_of(ROOT / "results" / "suite")
@@ -103,6 +103,26 @@ def test_the_readme_states_the_counts() -> None:
     match = re.search(r"(\d+) problems of three public suites\]\(docs/suite.md\) are stated, (\d+) of them", text)
     assert match is not None
     assert [int(number) for number in match.groups()] == [len(ENTRIES), len(SETTLED)]
+
+
+def test_the_page_counts_the_problems_that_are_solved_without_a_method() -> None:
+    solved = [row for row in ROWS.values() if row["automatic"] == "True"]
+    for row in solved:
+        assert float(row["automatic_seconds"]) < 61
+        assert reached(float(row["automatic_cost"]), float(row["cost"])), row["name"]
+    unguessed = sum(row["automatic_start"] == "no guess" for row in solved)
+    match = re.search(
+        r"solves (\d+) of the (\d+) problems without a guess, (\d+) more", PAGE.read_text(encoding="utf-8")
+    )
+    assert match is not None
+    assert [int(number) for number in match.groups()] == [unguessed, len(ENTRIES), len(solved) - unguessed]
+
+
+def test_a_problem_without_guess_starts_from_straight_lines() -> None:
+    problem = without_guess(ENTRIES["brac1"].build())
+    assert all(variable.guess is None for variable in problem.declared.states.values())
+    assert problem.declared.horizon is not None
+    assert problem.declared.horizon.guess is None
 
 
 def test_digits_and_verdicts() -> None:

@@ -80,6 +80,18 @@ def test_a_motion_that_leaves_for_infinity_breaks_down_where_it_does() -> None:
     assert not plan.audit().feasible
 
 
+@pytest.mark.parametrize("rate", [1e6, 1e8])
+def test_stiff_dynamics_follow_their_slow_motion(rate: float) -> None:
+    """x' = r (sin t + u - x) from 0, with u = 1 held: x = 1 + sin t - cos t / r at times well beyond 1 / r."""
+    problem, solution = driven(lambda x, u, t: rate * (ca.sin(t) + u - x), 3.0, control=1.0)
+    motion = again(problem, solution)
+    late = motion.t > 0.1
+    exact = 1 + np.sin(motion.t) - np.cos(motion.t) / rate
+    np.testing.assert_allclose(motion.states[late, 0], exact[late], atol=1e-9)
+    assert motion.cost == pytest.approx(3.0, rel=1e-9)
+    assert motion.breakdown_time is None
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
 @pytest.mark.parametrize("time", [1e-6, 1.0, 1e5])
 def test_the_integration_is_as_exact_in_any_unit(unit: float, time: float) -> None:
