@@ -330,7 +330,8 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
         s = np.append(begin, length)
         squares = reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
         # away from slow places the speed may grow manifold in a cell; next to rest, nodes are added below
-        steep = rates * np.diff(s) > SETTINGS.rise * np.minimum(squares[:-1], squares[1:])
+        gain = np.minimum(rates * np.diff(s), top**2)
+        steep = gain > SETTINGS.rise * np.minimum(squares[:-1], squares[1:])
         steep[[0, -1]], unlimited = False, np.isinf(jerk).all()
         if unlimited or not steep.any():
             break
