@@ -95,17 +95,19 @@ class Path:
         """Return the path of straight lines through given points.
 
         Args:
-            points: Points in world, at least two. Shape (n, 3), m.
+            points: Points in world, at least two. A doubled last point, as in recordings, counts once. Shape (n, 3), m.
             orientations: Unit quaternions at the points; None: the tool does not turn. Shape (n, 4).
 
         Raises:
             ModelError: Wrong sizes or values; or two successive points are equal, and the tool does not turn there.
         """
         corners = require.array("path: points", points, ("points", 3), least=2)
-        ends: list[Any] = [corners[:-1], corners[1:]]
+        values = [corners]
         if orientations is not None:
-            turns = require.array("path: orientations", orientations, (len(corners), 4))
-            ends += [turns[:-1], turns[1:]]
+            values.append(require.array("path: orientations", orientations, (len(corners), 4)))
+        if len(corners) > 2 and all(np.array_equal(each[-1], each[-2]) for each in values):
+            values = [each[:-1] for each in values]
+        ends = [part for each in values for part in (each[:-1], each[1:])]
         lines = []
         for number, each in enumerate(zip(*ends, strict=True)):
             try:

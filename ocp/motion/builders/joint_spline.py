@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -23,6 +24,7 @@ from models.robot.dynamics import GRAVITY, inverse_dynamics
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import PathLike
 from ocp.solution import Solution
+from ocp.tolerances import ROUNDING_SHARE
 
 DEGREE = 5
 ROW_OPERATIONS = {
@@ -51,7 +53,10 @@ class SplineSettings:
     # number of points of a path to which targets are compared, to find those that belong to the path
     path_samples: int = 200
     projections: int = 8  # number of Newton steps by which targets are projected onto the path
+    segment_samples: int = 12  # least number of samples of a plan in each segment of the path
     batch: int = 1024  # number of path points whose torques are computed together
+    few: int = 300  # number of path points below which casadi computes the torques sooner than NumPy does for a batch
+    points: int = 32  # number of path points of one such call
 
 
 SPLINE = SplineSettings()
@@ -134,9 +139,9 @@ def joint_path(
         machine: Machine of the joints.
         plan: A `Plan` of tasks that run along the whole path without a pause, in one part or several, with a fixed or
             free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
-            (M,) from 0 to the path's length and joint positions (M, n).
+            (M,) from 0 to the path's length and joint positions (M, n); ten samples resolve a segment of the path.
         path: Path of the tool.
-        samples: Number of samples of a plan, or of a solution, where they are evenly spaced in time.
+        samples: Least number of samples of a plan or a solution. Short segments of the path have more.
         names: Names of the joints; the robot's if None.
 
     Raises:
@@ -152,17 +157,38 @@ def joint_path(
         raise ProblemError(f"the path {path!r} has no length", name="path", value=path)
     if hasattr(plan, "task_share"):
         plan = _samples_of_plan(plan, path, float(length), samples)
-    s, joints = _checked_samples(plan, float(length), samples, machine.joint_size)
+    s, joints = _checked_samples(plan, path, samples, machine.joint_size)
     own = require.each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
     if len(own) != machine.joint_size:
         message = f"{len(own)} names for {machine.joint_size} joints"
         raise ProblemError(message, name="names", value=own, limit=machine.joint_size)
-    curves = scipy.interpolate.make_interp_spline(s, joints, k=DEGREE)
+    curves = scipy.interpolate.make_interp_spline(s, joints, k=DEGREE, t=_knots(s, path))
     half = np.arange(0, len(s), 2)
     half = half if half[-1] == len(s) - 1 else np.append(half, len(s) - 1)
-    coarse = scipy.interpolate.make_interp_spline(s[half], joints[half], k=DEGREE)
+    coarse = scipy.interpolate.make_interp_spline(s[half], joints[half], k=DEGREE, t=_knots(s[half], path))
     error = float(np.abs(coarse(s) - joints).max())
     return PlannedJoints(machine, own, float(length), error, curves, _torque_function(machine))
+
+
+def _knots(s: Array, path: Any) -> Array:
+    """Return the knots of an interpolating spline that is as smooth as the path where its segments meet.
+
+    The knots are at the samples (M,), except the samples next to a bound between two segments. Their knots are moved to
+    the bound: three for continuous second derivatives, four where the curvature jumps. A bound with fewer samples
+    nearby than that, because other bounds are nearer to them, has fewer knots.
+    """
+    inner = s[DEGREE // 2 + 1 : -(DEGREE // 2) - 1].copy()
+    bounds = np.asarray(getattr(path, "bounds", s[[0, -1]]), dtype=float)[1:-1]
+    if bounds.size:
+        jumps = path.curvature_jumps()
+        sharp, every = jumps > ROUNDING_SHARE * (1 + jumps.max()), np.ones(len(bounds), dtype=bool)
+        after, owner = np.searchsorted(inner, bounds), np.searchsorted((bounds[:-1] + bounds[1:]) / 2, inner)
+        for shift, moved in ((-2, sharp), (-1, every), (0, every), (1, every)):
+            at = np.clip(after + shift, 0, len(inner) - 1)
+            own = moved & (owner[at] == np.arange(len(bounds))) & (at == after + shift)
+            inner[at[own]] = bounds[own]
+    ends = np.ones(DEGREE + 1)
+    return np.concatenate([s[0] * ends, inner, s[-1] * ends])
 
 
 def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
@@ -171,15 +197,25 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
     The times are chosen so that the distances are nearly evenly spaced, also where the tool speeds up from rest.
     """
-    times = np.linspace(0.0, plan.horizon, samples)
+    times, places = np.linspace(0.0, plan.horizon, samples), _sample_places(path, length, samples)
     if not (plan.targets and hasattr(path, "at")):
+        times = np.interp(places, length * plan.task_share(times), times)
         return length * plan.task_share(times), plan.at(times)["joints"]
     if not hasattr(plan, "targets_at"):
         words = f"{plan!r} consists of several motions: give (distances, joints) of one motion along the path instead"
         raise ProblemError(words, name="plan", value=type(plan).__name__)
     distances = _distances_of_targets(plan, path, length, times)
-    times = np.interp(np.linspace(0.0, length, samples), distances, times)
+    times = np.interp(places, distances, times)
     return _distances_of_targets(plan, path, length, times), plan.at(times)["joints"]
+
+
+def _sample_places(path: Any, length: float, samples: int) -> Array:
+    """Return at least `samples` distances that are evenly spaced in each segment of a path and resolve all of them."""
+    bounds = np.asarray(getattr(path, "bounds", (0.0, length)), dtype=float)
+    shares = (samples - 1) * np.diff(bounds) / length
+    counts = np.maximum(np.ceil(shares * (1 - ROUNDING_SHARE)), SPLINE.segment_samples).astype(np.intp)
+    inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.append(np.repeat(bounds[:-1], counts) + inside * np.repeat(np.diff(bounds) / counts, counts), length)
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
@@ -228,8 +264,9 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
     return np.asarray(distance)
 
 
-def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
+def _checked_samples(plan: Any, path: PathLike, samples: int, size: int) -> tuple[Array, Array]:
     """Return path distances (M,) and joint positions (M, n) of a solution or of given samples, after checking them."""
+    length = float(path.length)
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)
@@ -237,7 +274,7 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
             raise ProblemError(f"samples are not numeric: {error}", name="plan", value=plan) from error
     else:
         require.instance("plan", plan, Solution)
-        fractions = np.linspace(0.0, 1.0, samples)
+        fractions = _sample_places(path, length, samples) / length
         try:
             joints = np.asarray(plan.at_fraction(fractions)["joints"], dtype=float)
         except KeyError as error:
@@ -261,6 +298,7 @@ class _BatchedFunction:
     """Evaluator of a casadi SX Function that applies each instruction to arrays of many inputs at once."""
 
     def __init__(self, function: Any) -> None:
+        self.several = function.map(SPLINE.points)
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
         # rows of the table: the function's own memory, its inputs, its outputs, its constants
         size = [function.size1_in(k) for k in range(function.n_in())]
@@ -290,21 +328,44 @@ class _BatchedFunction:
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """Return the outputs of the function for M inputs at once; each argument is an array of shape (M, n)."""
-        columns = np.concatenate([value.T for value in inputs])
-        count = columns.shape[1]
-        results = np.empty((sum(self.sizes), count))
+        count = len(inputs[0])
+        results = [np.empty((count, size)) for size in self.sizes]
+        for first in range(0, count, SPLINE.batch):
+            part = slice(first, min(first + SPLINE.batch, count))
+            evaluate = self._evaluate_points if part.stop - first < SPLINE.few else self._evaluate_batch
+            evaluate([value[part] for value in inputs], [value[part] for value in results])
+        return results
+
+    def _evaluate_points(self, inputs: list[Array], results: list[Array]) -> None:
+        """Evaluate the function for a few inputs one after the other, `SPLINE.points` in a call."""
+        buffer, evaluate = self.several.buffer()
+        memory = [np.zeros((SPLINE.points, value.shape[1])) for value in (*inputs, *results)]
+        for k in range(len(inputs)):
+            buffer.set_arg(k, memoryview(memory[k]))
+        for k in range(len(results)):
+            buffer.set_res(k, memoryview(memory[len(inputs) + k]))
+        for first in range(0, len(inputs[0]), SPLINE.points):
+            part = slice(first, min(first + SPLINE.points, len(inputs[0])))
+            for array, value in zip(memory, inputs, strict=False):
+                array[: part.stop - first] = value[part]
+            evaluate()
+            for array, result in zip(memory[len(inputs) :], results, strict=True):
+                result[part] = array[: part.stop - first]
+
+    def _evaluate_batch(self, inputs: list[Array], results: list[Array]) -> None:
+        """Evaluate the function for at most `SPLINE.batch` inputs at once."""
         try:
             table, steps = self.tables.pop()
         except IndexError:  # first call, or in use by another thread
             table, steps = self._table()
-        for first in range(0, count, SPLINE.batch):
-            here = min(SPLINE.batch, count - first)
-            table[self.inputs, :here] = columns[:, first : first + here]
-            for operation, places in steps:
-                operation(*places)
-            results[:, first : first + here] = table[self.outputs, :here]
+        count = len(inputs[0])
+        np.concatenate([value.T for value in inputs], out=table[self.inputs, :count])
+        for operation, places in steps:
+            operation(*places)
+        outputs = np.split(table[self.outputs, :count], np.cumsum(self.sizes)[:-1])
+        for result, part in zip(results, outputs, strict=True):
+            result[:] = part.T
         self.tables.append((table, steps))
-        return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
         """Return a work array with one line per intermediate value, and the function's instructions on its lines."""
@@ -314,6 +375,7 @@ class _BatchedFunction:
         return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
 
 
+@lru_cache(maxsize=8)
 def _torque_function(machine: Machine) -> _BatchedFunction | None:
     """Return a function of joint positions and their first two derivatives with respect to distance that computes the
     coefficients `_Torques` of the joint torques; None if the base moves.

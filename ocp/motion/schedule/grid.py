@@ -8,7 +8,8 @@ distance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -45,11 +46,13 @@ class GridSettings:
         closest: Ratio of neighbouring intervals below which their node is dropped, unless segments meet there.
         build_up, ramp: Duration of an interval over the time in which the acceleration builds up, or, if longer, over
             that in which the top speed is reached.
+        ramp_without_jerk: The latter without jerk limits, where the passes refine the grid.
         turn, least_build_up: Upper bound as a share of the ramp time, since the speed must not change much in an
             interval; lower bound as a share of the build-up, since with low jerks no motion gets near the acceleration
             limits.
         parts: Largest number of parts into which an interval that resolves the limits is split.
         growth: Ratio of neighbouring distances from rest, where the speed grows as their power 2/3.
+        rise: Largest growth of the squared speed in half a cell, over its least value.
         first: Duration of the first and last interval, of constant jerk, over that of the build-up.
     """
 
@@ -62,10 +65,12 @@ class GridSettings:
     closest: float = 0.05
     build_up: float = 0.25
     ramp: float = 0.05
+    ramp_without_jerk: float = 0.1
     turn: float = 0.25
     least_build_up: float = 0.05
     parts: int = 32
     growth: float = 1.2
+    rise: float = 2.0
     first: float = 0.3
 
 
@@ -98,23 +103,27 @@ class Grid:
     before: Array
     sharp: bool = True
 
+    @cached_property
+    def rows(self) -> Rows:
+        """Coefficients of all limits at all nodes, then just before the nodes where segments meet."""
+        return limit_rows(self.path, self.limits, self.joints, np.concatenate([self.distance, self.before]))
+
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
         """Return the coefficients of all limits at both ends of each of the N intervals between two nodes of the grid.
 
-        The rows are evaluated on request: all those of a long path would fill the memory.
+        The rows of a long path are evaluated on request: all of them would fill the memory.
         """
         at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
-        places = np.concatenate([self.distance[first : last + 1], self.before[at]])
-        rows = limit_rows(self.path, self.limits, self.joints, places)
-        count = last - first
+        count, nodes = last - first, len(self.distance)
+        used = np.concatenate([np.arange(first, last + 1), nodes + at])
+        if nodes <= BLOCK_SIZE:
+            rows = self.rows.take(used)
+        else:
+            places = np.concatenate([self.distance, self.before])[used]
+            rows = limit_rows(self.path, self.limits, self.joints, places)
         right = np.arange(1, count + 1)
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
         return rows.take(slice(count)), rows.take(right)
-
-    def halved(self) -> Grid:
-        """Return the grid with a further node in the middle of each interval."""
-        s = np.sort(np.concatenate([self.distance, (self.distance[:-1] + self.distance[1:]) / 2]))
-        return replace(self, distance=s, requested=np.repeat(self.requested, 2), jumps=2 * self.jumps)
 
     def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
@@ -157,51 +166,64 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     nodes = bounds[kept]
     sample_distances = path.sample_distances(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
     first = _separate(np.concatenate([sample_distances, nodes]), nodes)
+    inner = nodes[1:-1]
+    before = inner - np.minimum(16 * np.spacing(path.length), np.diff(nodes)[:-1] / 2)  # beyond rounding of a bound
     parts = [
-        _halve_intervals(path, limits, joints, first[begin : begin + BLOCK_SIZE + 1], (bounds, requested))
+        _halve_intervals(
+            path, limits, joints, first[begin : begin + BLOCK_SIZE + 1], (bounds, requested), (inner, before)
+        )
         for begin in range(0, len(first) - 1, BLOCK_SIZE)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
     s = _separate(np.concatenate([_time_nodes(cells, path.length), nodes]), nodes)
-    inner = nodes[1:-1]
-    before = inner - np.minimum(16 * np.spacing(path.length), np.diff(nodes)[:-1] / 2)  # beyond rounding of a bound
     of_interval = np.asarray(requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     sharp = bool(np.isfinite(cells.jerk).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
 def _halve_intervals(
-    path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
+    path: PathLike,
+    limits: LineLimits,
+    joints: JointPath | None,
+    s: Array,
+    requested: tuple[Array, Array],
+    jumps: tuple[Array, Array],
 ) -> _Cells:
     """Halve the intervals between distances `s` along a path until all limits vary almost linearly in each interval.
 
-    `requested` contains the bounds of the segments of the path, and the requested speed in each segment.
+    `requested` contains the bounds of the segments of the path, and the requested speed in each segment; `jumps` the
+    distances where limits may jump and those just before.
     """
-    rows = limit_rows(path, limits, joints, s)
-    _check_rest(rows, s, limit_names(limits, joints))
-    new = np.arange(len(s) - 1)
+    at = np.flatnonzero((jumps[0] > s[0]) & (jumps[0] <= s[-1]))
+    places = np.concatenate([s, jumps[1][at]])
+    rows = limit_rows(path, limits, joints, places)
+    _check_rest(rows, places, limit_names(limits, joints))
+    left, right = np.arange(len(s) - 1), np.arange(1, len(s))
+    right[np.searchsorted(s, jumps[0][at]) - 1] = len(s) + np.arange(len(at))
+    new, shares = left, (0.5, *GAUSS)
     for _ in range(SETTINGS.halvings):
-        middle, begin, end = (s[new] + s[new + 1]) / 2, rows.take(new), rows.take(new + 1)
-        middle_rows = limit_rows(path, limits, joints, middle)
-        top = _steady_speeds(rows, s, *requested)[new]
-        uneven = _uneven_intervals((begin, middle_rows, end), 0.5, top)
+        width, ends = np.diff(s)[new], (rows.take(left[new]), rows.take(right[new]))
+        top = _steady_speeds(*ends, s[new] + width / 2, *requested)
         # a wave may have equal phases at both ends and in the middle: other places tell
-        at = np.flatnonzero(~uneven)
-        for fraction in GAUSS if at.size else ():
-            beside = limit_rows(path, limits, joints, s[new[at]] + fraction * (s[new[at] + 1] - s[new[at]]))
-            uneven[at] |= _uneven_intervals((begin.take(at), beside, end.take(at)), fraction, top[at])
-        uneven &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
+        places = np.concatenate([s[new] + share * width for share in shares])
+        inside, uneven = limit_rows(path, limits, joints, places), np.zeros(len(new), dtype=bool)
+        for k, share in enumerate(shares):
+            between = inside.take(slice(k * len(new), (k + 1) * len(new)))
+            uneven |= _uneven_intervals((ends[0], between, ends[1]), share, top)
+        uneven &= width > SETTINGS.shortest * path.length
         if not uneven.any():
             break
-        cut = new[uneven]
-        s = np.insert(s, cut + 1, middle[uneven])
-        rows = Rows(*(np.insert(a, cut + 1, b[uneven], axis=0) for a, b in zip(rows, middle_rows, strict=True)))
+        cut, middle = new[uneven], np.flatnonzero(uneven)
+        s, middle = np.insert(s, cut + 1, places[middle]), len(rows.speed) + middle
+        left, right = np.insert(left, cut + 1, middle), np.insert(right, cut, middle)
+        rows = Rows(*(np.concatenate(kinds) for kinds in zip(rows, inside, strict=True)))
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
-    top, left, right = _steady_speeds(rows, s, *requested), rows.take(slice(-1)), rows.take(slice(1, None))
+    begin, end = rows.take(left), rows.take(right)
+    top = _steady_speeds(begin, end, (s[:-1] + s[1:]) / 2, *requested)
     with np.errstate(divide="ignore"):
-        jerk = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
-    acceleration = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
+        jerk = 1 / np.maximum(np.abs(begin.jerk[:, :, 0]), np.abs(end.jerk[:, :, 0])).max(axis=1, initial=0.0)
+    acceleration = 1 / np.maximum(np.abs(begin.acceleration[:, :, 0]), np.abs(end.acceleration[:, :, 0])).max(axis=1)
+    return _Cells(s[:-1], top, acceleration_bounds(begin, end, top**2, top**2), acceleration, jerk)
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
@@ -236,11 +258,13 @@ def _separate(places: Array, nodes: Array) -> Array:
     return s
 
 
-def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
-    """Return the fastest constant speed permitted in each interval, not above the requested speed. Shape (N,), m/s."""
-    steady = rows.steady()[0]
-    here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
-    return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
+def _steady_speeds(begin: Rows, end: Rows, inside: Array, bounds: Array, requested: Array) -> Array:
+    """Return the fastest constant speed permitted in each interval, not above the requested speed. Shape (N,), m/s.
+
+    `begin` and `end` are the limits at its ends, and `inside` is a distance in each interval.
+    """
+    steady = np.minimum(begin.steady()[0], end.steady()[0])
+    return np.asarray(np.minimum(steady, requested[segment_index(bounds, inside)]))
 
 
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
@@ -301,13 +325,23 @@ def node_minimum(of_intervals: Array) -> Array:
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
-    _, top, rates, acceleration, jerk = cells
-    s = np.append(cells.begin, length)
-    squares = reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
+    for _ in range(2 * SETTINGS.halvings):
+        begin, top, rates, acceleration, jerk = cells
+        s = np.append(begin, length)
+        squares = reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
+        # away from slow places the speed may grow manifold in a cell; next to rest, nodes are added below
+        gain = np.minimum(rates * np.diff(s), top**2)
+        steep = gain > SETTINGS.rise * np.minimum(squares[:-1], squares[1:])
+        steep[[0, -1]], unlimited = False, np.isinf(jerk).all()
+        if unlimited or not steep.any():
+            break
+        cells = _Cells(*(np.repeat(kind, 1 + steep) for kind in cells))
+        cells.begin[np.cumsum(1 + steep)[steep] - 1] += (np.diff(s) / 2)[steep]
     ramp = top / acceleration
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))
-    duration = np.minimum(np.maximum(SETTINGS.build_up * build_up, SETTINGS.ramp * ramp), SETTINGS.turn * ramp)
+    share = SETTINGS.ramp_without_jerk if unlimited else SETTINGS.ramp
+    duration = np.minimum(np.maximum(SETTINGS.build_up * build_up, share * ramp), SETTINGS.turn * ramp)
     duration = np.maximum(duration, SETTINGS.least_build_up * build_up)
     speed = np.sqrt(np.maximum(np.maximum(squares[:-1], squares[1:]), 0.0))
     longest = np.minimum(speed * duration, length)
@@ -315,6 +349,8 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
     parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
     index = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * index, length)
+    if unlimited:  # the squared speed grows in proportion to the distance from rest
+        return nodes
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):
         away = nodes if end == 0 else length - nodes

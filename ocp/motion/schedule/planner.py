@@ -42,7 +42,6 @@ class ScheduleSettings:
 
     Attributes:
         curve_halvings: Largest number of halvings of an interval of the velocity curve, whose minima are sharp.
-        grid_halvings: Largest number of halvings of the grid on which no motion keeps the limits between the nodes.
         reached: Relative reduction of the requested speed above which a motion counts as slower.
         leaving: Relative reduction accepted near the ends of a stretch that is long enough.
         long_path: Number of segments from which a path with centripetal limits alone uses ramps, at a fiftieth of the
@@ -57,7 +56,6 @@ class ScheduleSettings:
     """
 
     curve_halvings: int = 12
-    grid_halvings: int = 2
     reached: float = 1e-4
     leaving: float = 1e-5
     long_path: int = 400
@@ -295,14 +293,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
         grid = coarse_grid(path, limits)
     else:
         grid = make_grid(path, limits, limited)
-        for halvings_left in reversed(range(SETTINGS.grid_halvings + 1)):
-            try:
-                profile = _constrained_profile(grid, line_profile)
-                break
-            except ProblemError as error:
-                if not halvings_left or error.limit != 1:  # infeasible, or infeasible in the grid only
-                    raise
-                grid = grid.halved()
+        profile = _constrained_profile(grid, line_profile)
     dips = () if profile is line_profile else _find_dips(grid, profile, limit_names(limits, limited))
     if strict and dips:
         listed = "\n  ".join(str(dip) for dip in dips[:10])

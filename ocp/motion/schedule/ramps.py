@@ -18,6 +18,7 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from models.checks import Array
@@ -200,7 +201,7 @@ def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[fl
 
 
 class _Bounds(NamedTuple):
-    """Bounds of the acceleration u at squared speed x: low + slope x <= u <= high + slope x. Shape (N, R) each."""
+    """Bounds of the acceleration u at squared speed x: low + slope x <= u <= high + slope x. Shape (R, P) each."""
 
     slope: Array
     low: Array
@@ -210,27 +211,31 @@ class _Bounds(NamedTuple):
     def build(cls, rows: Array) -> _Bounds:
         """Return the bounds of acceleration u at squared speed x that -1 <= p u + q x + r <= 1 sets for rows (p, q, r).
 
-        Shape (N, R, 3).
+        Shape (3, R, P).
         """
-        p, q, r = np.moveaxis(rows, 2, 0)
+        p, q, r = rows
         size = np.abs(p)
-        free = size <= NO_INERTIA * size.max(axis=1, keepdims=True)
+        free = size <= NO_INERTIA * size.max(axis=0)
         inverse = 1 / np.where(free, 1.0, p)
         middle, reach = -r * inverse, np.where(free, UNBOUNDED, np.abs(inverse))
         return cls(np.where(free, 0.0, -q * inverse), middle - reach, middle + reach)
 
+    def take(self, places: NDArray[np.intp] | slice) -> _Bounds:
+        """Return the bounds at a subset of the places."""
+        return _Bounds(*(kind[:, places] for kind in self))
+
     def at(self, x: Array) -> tuple[Array, Array, Array]:
         """Return the greatest lower and least upper bound of u at squared speeds x, and the slope of their gap."""
-        change, each = self.slope * x[:, None], np.arange(len(x))
+        change, each = self.slope * x, np.arange(len(x))
         below, above = change + self.low, change + self.high
-        low, high = below.argmax(axis=1), above.argmin(axis=1)
-        return below[each, low], above[each, high], self.slope[each, high] - self.slope[each, low]
+        low, high = below.argmax(axis=0), above.argmin(axis=0)
+        return below[low, each], above[high, each], self.slope[high, each] - self.slope[low, each]
 
     def feasible(self, caps: Array) -> Array:
-        """Return the greatest squared speeds, at most `caps` (N,), at which an acceleration satisfies all bounds."""
+        """Return the greatest squared speeds, at most `caps` (P,), at which an acceleration satisfies all bounds."""
         x, at = caps.copy(), np.flatnonzero(caps > 0)
         while at.size:  # Newton's method on a concave function, from above its root
-            low, high, slope = _Bounds(*(kind[at] for kind in self)).at(x[at])
+            low, high, slope = self.take(at).at(x[at])
             beyond = low - high > ROUNDING_SHARE * (np.abs(low) + np.abs(high))
             at = at[beyond]
             x[at] = np.maximum(x[at] + ((low - high)[beyond] / slope[beyond]), 0.0)
@@ -238,14 +243,16 @@ class _Bounds(NamedTuple):
         return x
 
 
-def reachability_passes(distance: Array, caps: Array, left: Array, right: Array) -> tuple[Array, Array, Array]:
+def reachability_passes(
+    distance: Array, caps: Array, rows: Array, jumps: tuple[NDArray[np.intp], Array]
+) -> tuple[Array, Array, Array]:
     """Return the greatest squared speeds at path nodes (N + 1,), by a backward and a forward pass, and accelerations.
 
     Args:
         distance: Distances of the nodes. Shape (N + 1,), m.
-        caps: Greatest permitted squared speed at each node; 0 at rest. Shape (N + 1,).
-        left, right: Coefficients (p, q, r) of rows -1 <= p u + q x + r <= 1 with -1 < r < 1, where each interval
-            begins and where it ends. Shape (N, R, 3).
+        caps: Greatest permitted squared speeds at the nodes; 0 at rest. Shape (N + 1,).
+        rows: Coefficients (p, q, r) of rows -1 <= p u + q x + r <= 1 with -1 < r < 1 at the nodes. Shape (3, R, N + 1).
+        jumps: Indices of the intervals at whose ends these rows jump, and the rows just before. Shape (J,), (3, R, J).
 
     Returns:
         The squared speeds, and the accelerations where each interval begins and where it ends. Shape (N,).
@@ -253,35 +260,41 @@ def reachability_passes(distance: Array, caps: Array, left: Array, right: Array)
     Raises:
         ProblemError: The motion must stop at a node, its distance (m) as `time`.
     """
-    h = np.diff(distance)[:, None]
-    begin, end = _Bounds.build(left), _Bounds.build(right)
-    most = caps.copy()
-    most[:-1] = begin.feasible(most[:-1])
-    most[1:] = end.feasible(most[1:])
-    # near a point of zero inertia a bound is steeper than the interval is short: one acceleration holds at both ends
-    p, q = (np.abs([side[:, :, seat] for side in (left, right)]) for seat in (0, 1))
-    active = q.max(axis=0) * np.maximum(caps[1:], caps[:-1])[:, None] > ACTIVE_USAGE
-    stiff = (active & (h * q > p).any(axis=0)).any(axis=1)
-    moved = right[stiff]
-    moved[:, :, 0] += 2 * h[stiff] * moved[:, :, 1]
-    both = _Bounds.build(np.concatenate([left[stiff], moved], axis=1))
+    h, (at, before), bounds, bounds_before = np.diff(distance), jumps, _Bounds.build(rows), _Bounds.build(jumps[1])
+    most = bounds.feasible(caps)
+    most[at + 1] = bounds_before.feasible(most[at + 1])
+    begin, end = bounds.take(slice(-1)), bounds.take(slice(1, None))
+    right = rows[:, :, 1:]
+    if at.size:
+        right, end = right.copy(), _Bounds(*(kind.copy() for kind in end))
+        right[:, :, at] = before
+        for kind, values in zip(end, bounds_before, strict=True):
+            kind[:, at] = values
+    # near a point of zero inertia a bound is steeper than the interval is short, and next to rest the acceleration is
+    # no linear function of time: one acceleration holds at both ends
+    (p, q), (p_end, q_end) = np.abs(rows[:2, :, :-1]), np.abs(right[:2])
+    active = np.maximum(q, q_end) * np.maximum(caps[1:], caps[:-1]) > ACTIVE_USAGE
+    stiff = (active & ((h * q > p) | (h * q_end > p_end))).any(axis=0) | (caps[1:] == 0) | (caps[:-1] == 0)
+    left, moved = rows[:, :, :-1][:, :, stiff], right[:, :, stiff]
+    moved[0] += 2 * h[stiff] * moved[1]
+    both = _Bounds.build(np.concatenate([left, moved], axis=1))
     most[:-1][stiff] = both.feasible(most[:-1][stiff])
     padded = []
     for own, fill, at_both in zip(begin, (0.0, -UNBOUNDED, UNBOUNDED), both, strict=True):
-        padded.append(np.append(own, np.full(own.shape, fill), axis=1))
-        padded[-1][stiff] = at_both
+        padded.append(np.concatenate([own, np.full(own.shape, fill)]))
+        padded[-1][:, stiff] = at_both
     begin = _Bounds(*padded)
     # the squared speed grows by w u at the beginning + z u at the end
-    w, z = np.where(stiff[:, None], 2 * h, h), np.where(stiff[:, None], 0.0, h)
+    w, z = np.where(stiff, 2 * h, h), np.where(stiff, 0.0, h)
     of_begin, of_end = 1 + w * begin.slope, 1 - z * end.slope
     backward = (of_begin, w * begin.low), (of_end, -z * end.low)
-    top = _greatest_squares(most[::-1], *((slope[::-1], offset[::-1]) for slope, offset in backward))[::-1]
+    top = _greatest_squares(most[::-1], *((slope[:, ::-1], offset[:, ::-1]) for slope, offset in backward))[::-1]
     x = _greatest_squares(top, (of_end, -z * end.high), (of_begin, w * begin.high))
     if not x[1:-1].all():
         place = float(distance[1 + int((x[1:-1] == 0).argmax())])
         message = f"no motion keeps the limits of acceleration and torque at {place:g} m; raise them"
         raise ProblemError(message, name="acceleration", value=0.0, limit=0.0, time=place)
-    total = np.diff(x) / h[:, 0]
+    total = np.diff(x) / h
     (low, high, _), (low_end, high_end, _) = begin.at(x[:-1]), end.at(x[1:])
     u = np.minimum(np.maximum(total / 2, np.maximum(low, total - high_end)), np.minimum(high, total - low_end))
     u = np.where(stiff, total / 2, u)
@@ -296,23 +309,26 @@ def _greatest_squares(caps: Array, near: tuple[Array, Array], far: tuple[Array, 
 
     Args:
         caps: Upper bounds. Shape (N + 1,).
-        near, far: a and b, c and d. Shape (N, R) each.
+        near, far: a and b, c and d. Shape (R, N) each.
     """
-    each, x, bounds = np.arange(len(caps) - 1), caps, caps[1:].tolist()
+    each, x, bounds, lines = np.arange(len(caps) - 1), caps, caps[1:].tolist(), np.zeros(0)
     for _ in each:
-        i, j = (near[0] * x[1:, None] + near[1]).argmax(axis=1), (far[0] * x[:-1, None] + far[1]).argmin(axis=1)
-        slope = near[0][each, i]
+        i, j = (near[0] * x[1:] + near[1]).argmax(axis=0), (far[0] * x[:-1] + far[1]).argmin(axis=0)
+        before, lines = lines, np.stack([i, j])
+        if np.array_equal(lines, before):
+            break
+        slope = near[0][i, each]
         rises = slope > 0  # else the bound falls and does not limit x
         slope = np.where(rises, slope, 1.0)
-        factor = np.where(rises, far[0][each, j], 0.0) / slope
-        shift = np.where(rises, far[1][each, j] - near[1][each, i], UNBOUNDED) / slope
+        factor = np.where(rises, far[0][j, each], 0.0) / slope
+        shift = np.where(rises, far[1][j, each] - near[1][i, each], UNBOUNDED) / slope
         value = float(caps[0])
         values = [value]
         for gain, more, cap in zip(factor.tolist(), shift.tolist(), bounds, strict=True):
             value = gain * value + more
             value = cap if value > cap else value if value > 0.0 else 0.0  # quicker than min and max
             values.append(value)
-        before, x = x, np.array(values)
-        if np.abs(x - before).max() <= ROUNDING_SHARE * x.max():
+        last, x = x, np.array(values)
+        if np.abs(x - last).max() <= ROUNDING_SHARE * x.max():
             break
     return x

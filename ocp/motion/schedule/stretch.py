@@ -52,6 +52,7 @@ class StretchSettings:
             which they are halved.
         exceeded: Share by which a motion without jerk limits may exceed limits between nodes: half of the promised
             accuracy of 1e-3.
+        parts: Largest number of parts into which an interval is split at once.
         accuracies: Relative accuracy of the travel time of a window in each round, no finer than the enforced limits
             still change; the last value serves all later rounds.
         around, few: Intervals on either side of a violated one that are planned again with it; only these are planned
@@ -69,6 +70,7 @@ class StretchSettings:
     rounds: int = 20
     unused: float = 1e-4
     exceeded: float = 5e-4
+    parts: int = 8
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
     around: int = 40
     few: float = 1 / 6
@@ -174,71 +176,102 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
+class _Samples:
+    """Limits at places of a path that has no jerk limits, to which more places are added.
+
+    Attributes:
+        speed: Largest coefficient of the speed in a limit. Shape (P,), s/m.
+        rows: Coefficients (p, q, r) of the limits of the acceleration. Shape (3, R, P).
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self.speed, self.rows = self._columns(grid.rows)
+
+    def add(self, places: Array) -> NDArray[np.intp]:
+        """Evaluate the limits at distances (M,) along the path; return the indices of these places."""
+        grid, first = self.grid, len(self.speed)
+        speed, rows = self._columns(limit_rows(grid.path, grid.limits, grid.joints, places))
+        self.speed, self.rows = np.append(self.speed, speed), np.concatenate([self.rows, rows], axis=2)
+        return np.arange(first, len(self.speed))
+
+    def usage(self, motion: LineMotion, places: NDArray[np.intp]) -> Array:
+        """Return the ratio, with sign, of each limited quantity of a motion at M places to its limit. Shape (R, M)."""
+        p, q, r = self.rows[:, :, places]
+        speed = self.speed[places] * motion.speed
+        return np.concatenate([speed[None], p * motion.acceleration + q * motion.speed**2 + r])
+
+    @staticmethod
+    def _columns(rows: Rows) -> tuple[Array, Array]:
+        return rows.speed.max(axis=1), np.ascontiguousarray(rows.acceleration.T)
+
+
 def _solve_without_jerk(grid: Grid) -> SpeedProfile:
     """Return the fastest motion along a path for unlimited jerk, by two passes on a grid that is refined in rounds.
 
-    An interval is halved while a limit is violated inside it, and in the first rounds where a limit is active at both
-    ends but none in the middle.
+    An interval is split while a limit is violated inside it, and in the first rounds where a limit is active at an end
+    but none in the middle.
 
     Raises:
         ProblemError: A limit is violated in the shortest intervals too, with the distance.
     """
-    s, requested = grid.distance, grid.requested
-    sides = grid.ends(0, len(requested))
-    middle = limit_rows(grid.path, grid.limits, grid.joints, (s[:-1] + s[1:]) / 2)
+    s, requested, samples = grid.distance, grid.requested, _Samples(grid)
+    nodes, before, jumps = np.arange(len(s)), len(s) + np.arange(len(grid.before)), grid.jumps - 1
+    middle, beside = np.empty((2, len(requested)), dtype=np.intp)
+    new, inner = np.full(len(requested), True), np.full(len(s), False)
     for _ in range(SETTINGS.rounds):
-        caps = np.minimum(node_minimum(requested) ** 2, _row_speed_caps(*sides))
+        h = np.diff(s)
+        added = samples.add(np.concatenate([s[inner], (s[:-1] + h / 2)[new], (s[:-1] + GAUSS[0] * h)[new]]))
+        nodes[inner], middle[new], beside[new] = np.split(added, np.cumsum([inner.sum(), new.sum()]))
+        right = nodes[1:].copy()
+        right[jumps] = before
+        slowest = samples.speed[nodes]
+        slowest[1:] = np.maximum(slowest[1:], samples.speed[right])
+        with np.errstate(divide="ignore"):
+            caps = np.minimum(node_minimum(requested) ** 2, slowest**-2.0)
         caps[[0, -1]] = 0.0
-        x, *rates = reachability_passes(s, caps, *(side.acceleration for side in sides))
+        x, *rates = reachability_passes(s, caps, samples.rows[:, :, nodes], (jumps, samples.rows[:, :, before]))
         profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
-        used, peak = _usage_without_jerk(profile, (sides[0], middle, sides[1]), requested)
-        cut = peak > 1 + SETTINGS.exceeded
-        unused = np.where(used[[0, 2]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[1], 0.0)
+        used, peak = _usage_without_jerk(profile, samples, (nodes[:-1], beside, middle, right), requested)
+        # the excess falls at least as fast as the length of the interval
+        parts = np.clip(np.ceil(2 * (peak - 1) / SETTINGS.exceeded) - 1, 1, SETTINGS.parts).astype(np.intp)
+        unused = np.where(used[[0, -1]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[2], 0.0)
         if unused @ np.diff(profile.t) > SETTINGS.unused * profile.duration:
-            cut |= unused > 2 * SETTINGS.exceeded
-        if not cut.any():
-            for fraction in GAUSS:
-                inside = profile.at_distance(s[:-1] + fraction * np.diff(s))
-                rows = limit_rows(grid.path, grid.limits, grid.joints, inside.distance)
-                cut |= np.abs(rows.usage(inside)).max(axis=1) > 1 + SETTINGS.exceeded
-            if not cut.any():
-                return profile
-        # both halves of an interval: its rows in the middle are at the end of one and at the beginning of the other
-        at = np.repeat(np.arange(len(cut)), 1 + cut)
-        second = np.flatnonzero(np.diff(at) == 0) + 1
-        new = np.union1d(second - 1, second)
-        s, requested = np.union1d(s, ((s[:-1] + s[1:]) / 2)[cut]), requested[at]
-        quarters = limit_rows(grid.path, grid.limits, grid.joints, ((s[:-1] + s[1:]) / 2)[new])
-        halves = middle.take(cut)
-        sides, middle = (sides[0].take(at), sides[1].take(at)), middle.take(at)
-        for rows, which, values in (
-            (sides[0], second, halves),
-            (sides[1], second - 1, halves),
-            (middle, new, quarters),
-        ):
-            for kind, own in zip(rows, values, strict=True):
-                kind[which] = own
+            parts = np.maximum(parts, 1 + (unused > 2 * SETTINGS.exceeded))
+        if not (parts > 1).any():
+            return profile
+        at = np.repeat(np.arange(len(parts)), parts)
+        number = np.arange(len(at)) - (np.cumsum(parts) - parts)[at]
+        s, inner = np.append(s[at] + h[at] * number / parts[at], s[-1]), np.append(number > 0, False)
+        nodes, jumps = np.append(nodes[at], nodes[-1]), np.cumsum(parts)[jumps] - 1
+        requested, middle, beside, new = requested[at], middle[at], beside[at], parts[at] > 1
     worst = int(peak.argmax())
     place, largest = float(profile.distance[worst]), float(peak[worst])
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
 
 
-def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested: Array) -> tuple[Array, Array]:
-    """Return the largest usage of any limit at start, middle and end of each interval, (3, N), and inside it, (N,).
+def _usage_without_jerk(
+    profile: SpeedProfile, samples: _Samples, places: tuple[NDArray[np.intp], ...], requested: Array
+) -> tuple[Array, Array]:
+    """Return the largest usage of any limit at four places of each interval, (4, N), and anywhere inside it, (N,).
 
-    Each row is interpolated by a parabola through the three places.
+    The places are the start, the first Gauss point, the middle and the end. Each row is interpolated by a parabola
+    through the others; its error at the Gauss point, where the error of a cubic is largest, is added.
     """
+    start, end, h = *(profile.distance[part] for part in (slice(-1), slice(1, None))), np.diff(profile.distance)
+    inside = profile.at_distance(np.concatenate([start + GAUSS[0] * h, start + h / 2]))
     t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
     first = LineMotion(t, s, v, a, profile.jerk)
-    inside = profile.at_distance((profile.distance[:-1] + profile.distance[1:]) / 2)
-    end = first.acceleration + profile.jerk * np.diff(profile.t)
-    last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
-    motions = first, inside, last
-    values = np.stack([each.usage(motion) for each, motion in zip(rows, motions, strict=True)])
-    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(parabola_peak(values, (0.0, 0.5, 1.0))).max(axis=1))
-    used = np.maximum(np.abs(values).max(axis=2), [motion.speed / requested for motion in motions])
-    return used, np.maximum(peak, used.max(axis=0))
+    last = LineMotion(profile.t[1:], end, profile.speed[1:], a + profile.jerk * np.diff(profile.t), profile.jerk)
+    halves = slice(len(h)), slice(len(h), None)
+    motions = first, *(LineMotion(*(kind[part] for kind in inside)) for part in halves), last
+    values = np.stack([samples.usage(motion, at) for motion, at in zip(motions, places, strict=True)])
+    used = np.maximum(np.abs(values).max(axis=1), [motion.speed / requested for motion in motions])
+    weights = (1 - GAUSS[0]) * (1 - 2 * GAUSS[0]), 4 * GAUSS[0] * (1 - GAUSS[0]), GAUSS[0] * (2 * GAUSS[0] - 1)
+    error = np.abs(weights[0] * values[0] + weights[1] * values[2] + weights[2] * values[3] - values[1])
+    vertex = np.abs(parabola_peak(values[[0, 2, 3]], (0.0, 0.5, 1.0)))
+    return used, np.maximum((vertex + error).max(axis=0), used.max(axis=0))
 
 
 def _row_speed_caps(left: Rows, right: Rows) -> Array:

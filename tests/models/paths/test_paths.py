@@ -53,7 +53,14 @@ def test_a_path_with_a_gap_is_a_named_error() -> None:
         Path((Line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), Line((1.1, 0.0, 0.0), (1.1, 1.0, 0.0))))
 
 
-@pytest.mark.parametrize("twice", [0, 1, 2])
+def test_a_doubled_last_point_counts_once() -> None:
+    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
+    assert Path.through(points[[0, 1, 2, 2]]).lengths == pytest.approx([1.0, 1.0])
+    with pytest.raises(ModelError, match="length 0"):
+        Path.through(points[[2, 2]])
+
+
+@pytest.mark.parametrize("twice", [0, 1])
 def test_a_repeated_point_is_named_by_its_number(twice: int) -> None:
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
     with pytest.raises(ModelError, match=rf"points\[{twice}\] to points\[{twice + 1}\]: .*length 0") as caught:

@@ -128,21 +128,25 @@ def test_the_passes_equal_a_linear_program(seed: int, rows: int, reverses: bool)
     p = size * (np.cos(2 * np.pi * s[:, None] + phase[0]) + (0.0 if reverses else 1.3))
     q = rng.uniform(0, 2) * np.sin(2 * np.pi * s[:, None] + phase[1])
     most = rng.uniform(0.5, 2, count + 1)
-    here, there = (np.stack([p[part], q[part], 0 * p[part]], axis=2) for part in (slice(-1), slice(1, None)))
-    x, first, last = reachability_passes(s, np.where(np.isin(s, [0, 1]), 0.0, most), here, there)
+    jumps, before = np.zeros(0, dtype=np.intp), np.zeros((3, rows, 0))
+    limits = np.stack([p.T, q.T, 0 * p.T])
+    x, first, last = reachability_passes(s, np.where(np.isin(s, [0, 1]), 0.0, most), limits, (jumps, before))
     # unknowns: squared speeds, then accelerations where intervals begin and where they end
     matrix, equal, bounds = [], [], [(0, 0), *((0, top) for top in most[1:-1]), (0, 0), *[(None, None)] * (2 * count)]
     for k in range(count):
         growth = np.zeros(3 * count + 1)
         growth[[k, k + 1, count + 1 + k, 2 * count + 1 + k]] = 1, -1, h[k], h[k]
         equal.append(growth)
+        if k in (0, count - 1):  # one acceleration next to rest
+            equal.append(np.zeros(3 * count + 1))
+            equal[-1][[count + 1 + k, 2 * count + 1 + k]] = 1, -1
         for side in (0, 1):
             for r in range(rows):
                 row = np.zeros(3 * count + 1)
                 row[k + side], row[(1 + side) * count + 1 + k] = q[k + side, r], p[k + side, r]
                 matrix += [row, -row]
     cost = -np.concatenate([np.ones(count + 1), np.zeros(2 * count)])
-    result = linprog(cost, np.array(matrix), np.ones(len(matrix)), np.array(equal), np.zeros(count), bounds=bounds)
+    result = linprog(cost, np.array(matrix), np.ones(len(matrix)), np.array(equal), np.zeros(count + 2), bounds=bounds)
     solution = np.concatenate([x, first, last])
     if not reverses:
         assert (np.array(matrix) @ solution <= 1 + 1e-9).all()

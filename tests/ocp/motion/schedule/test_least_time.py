@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,8 @@ from tests.ocp.problems import Array
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "ignore:overlap='shrink'")
 FREE = LineLimits(1e4, 1e5, np.inf)
 """Limits of the line that no case reaches."""
+LENGTHS = "build_up", "ramp", "ramp_without_jerk", "turn", "least_build_up"
+"""Settings of the grid to which the lengths of its intervals are proportional."""
 UNIT = smooth(Path.through([(0, 0, 0), (1, 0, 0)]), 0.01)
 TOTG = [(1427, 368, 690), (1427, 368, 790), (952.499938964844, 433, 1051), (452.5, 533, 1051), (452.5, 533, 951)]
 
@@ -188,7 +191,7 @@ def test_half_the_nodes_never_make_a_motion_faster_than_the_optimum(
     limits = replace(FREE, jerk=1e4 * jerk, joints=replace(random_limits(seed), jerk=jerk))
     default, plans = grids.SETTINGS, {}
     for spacing in (0.25, 1.0, 2.0):
-        lengths = {name: spacing * getattr(default, name) for name in ("build_up", "ramp", "turn", "least_build_up")}
+        lengths = {name: spacing * getattr(default, name) for name in LENGTHS}
         # the error of interpolation grows with the square of the spacing
         errors = {name: spacing**2 * getattr(default, name) for name in ("uneven", "uneven_speed")}
         segments = round(default.segments / spacing)
@@ -200,6 +203,14 @@ def test_half_the_nodes_never_make_a_motion_faster_than_the_optimum(
     assert min(plans[1.0].duration, plans[2.0].duration) >= plans[0.25].duration * (1 - 1e-4)
 
 
+def lines_of_all_sizes(seed: int) -> SmoothPath:
+    """A path of rounded lines from 10 um to 1 m."""
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(size=(int(rng.integers(2, 12)), 3))
+    steps *= (10 ** rng.uniform(-5, 0, len(steps)) / np.linalg.norm(steps, axis=1))[:, None]
+    return smooth(Path.through(np.cumsum(np.append(np.zeros((1, 3)), steps, axis=0), axis=0)), deviation=1e-4)
+
+
 SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(3, 100))]
 
 
@@ -207,12 +218,34 @@ SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in range
 @pytest.mark.parametrize("seed", SEEDS)
 def test_axes_keep_their_limits_on_segments_of_all_sizes(seed: int, jerk: float) -> None:
     """Segments from 10 um to 1 m, as CAM writes them."""
-    rng = np.random.default_rng(seed)
-    steps = rng.normal(size=(int(rng.integers(2, 12)), 3))
-    steps *= (10 ** rng.uniform(-5, 0, len(steps)) / np.linalg.norm(steps, axis=1))[:, None]
-    path = smooth(Path.through(np.cumsum(np.append(np.zeros((1, 3)), steps, axis=0), axis=0)), deviation=1e-4)
+    path = lines_of_all_sizes(seed)
     limits = LineLimits(1.0, 20.0, 10 * jerk, joints=JointLimits(0.5, 10.0, jerk))
     assert greatest_usage(schedule(path, limits, joints=Axes(path))) <= 1.001
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_time_does_not_depend_on_the_number_of_samples(seed: int) -> None:
+    """The spline through the samples is no smoother than the path where its segments meet."""
+    path = lines_of_all_sizes(seed)
+    limits = LineLimits(1.0, 20.0, np.inf, joints=JointLimits(0.5, 10.0))
+    exact = schedule(path, limits, joints=Axes(path)).duration
+    for samples in (12, 30):
+        parts = [np.linspace(*ends, samples, endpoint=False) for ends in pairwise(path.bounds)]
+        s = np.append(np.concatenate(parts), path.length)
+        joints = joint_path(FixedBase(planar_chain([1.0] * 3, [1.0] * 3)), (s, path.at(s).position), path)
+        plan = schedule(path, limits, joints=joints)
+        assert plan.duration == pytest.approx(exact, rel=1e-3)
+        assert greatest_usage(plan) <= 1.001
+
+
+@pytest.mark.parametrize("seed", [6, 8])
+def test_finer_nodes_between_slow_bends_are_hardly_faster(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a sharp bend the speed grows manifold in a short part of a line, which needs nodes of its own."""
+    path, default = lines_of_all_sizes(seed), grids.SETTINGS
+    limits = LineLimits(1.0, 20.0, 2000.0, joints=JointLimits(0.5, 10.0, 200.0))
+    plan = schedule(path, limits, joints=Axes(path))
+    monkeypatch.setattr(grids, "SETTINGS", replace(default, rise=default.rise / 4, cells=2 * default.cells))
+    assert plan.duration <= schedule(path, limits, joints=Axes(path)).duration * 1.005
 
 
 @pytest.mark.parametrize("seed", SEEDS)
