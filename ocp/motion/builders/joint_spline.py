@@ -167,7 +167,8 @@ def joint_path(
     half = half if half[-1] == len(s) - 1 else np.append(half, len(s) - 1)
     coarse = scipy.interpolate.make_interp_spline(s[half], joints[half], k=DEGREE, t=_knots(s[half], path))
     error = float(np.abs(coarse(s) - joints).max())
-    return PlannedJoints(machine, own, float(length), error, curves, _torque_function(machine))
+    torques = _torque_function(machine) if isinstance(machine, FixedBase) else None
+    return PlannedJoints(machine, own, float(length), error, curves, torques)
 
 
 def _knots(s: Array, path: Any) -> Array:
@@ -341,9 +342,9 @@ class _BatchedFunction:
         buffer, evaluate = self.several.buffer()
         memory = [np.zeros((SPLINE.points, value.shape[1])) for value in (*inputs, *results)]
         for k in range(len(inputs)):
-            buffer.set_arg(k, memoryview(memory[k]))
+            buffer.set_arg(k, memory[k].data)
         for k in range(len(results)):
-            buffer.set_res(k, memoryview(memory[len(inputs) + k]))
+            buffer.set_res(k, memory[len(inputs) + k].data)
         for first in range(0, len(inputs[0]), SPLINE.points):
             part = slice(first, min(first + SPLINE.points, len(inputs[0])))
             for array, value in zip(memory, inputs, strict=False):
@@ -376,12 +377,10 @@ class _BatchedFunction:
 
 
 @lru_cache(maxsize=8)
-def _torque_function(machine: Machine) -> _BatchedFunction | None:
+def _torque_function(machine: FixedBase) -> _BatchedFunction:
     """Return a function of joint positions and their first two derivatives with respect to distance that computes the
-    coefficients `_Torques` of the joint torques; None if the base moves.
+    coefficients `_Torques` of the joint torques.
     """
-    if not isinstance(machine, FixedBase):
-        return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))
     still = ca.SX.zeros(machine.joint_size)
 
