@@ -136,6 +136,34 @@ class Homogeneous(StepCost):
 class PathLength(Homogeneous):
     """Cost of a step: the weighted sum of the absolute joint displacements."""
 
+    def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
+        """Return what `Homogeneous.minimize` returns; on curves, the minimum is exact.
+
+        It lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises by
+        2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
+        """
+        if target.low.shape[1] != 1:
+            return super().minimize(delta, target, after)
+        scaled, offset = self.weights * target.tangents[:, :, 0], self.weights * delta
+        with np.errstate(divide="ignore", invalid="ignore"):
+            zeros = np.where(scaled != 0, -offset / scaled, np.inf)
+        rises = np.abs(scaled)
+        order, rows = np.argsort(zeros, axis=1), np.arange(len(zeros))
+        slopes = after.slope - rises.sum(axis=1, keepdims=True)
+        slopes = slopes + 2 * np.take_along_axis(rises, order, axis=1).cumsum(axis=1)
+        joint = order[rows, np.argmax(slopes >= 0, axis=1)]
+        median = np.where((slopes >= 0).any(axis=1), zeros[rows, joint], np.inf)
+        place = np.clip(median, target.low[:, 0], target.high[:, 0])
+        shares = np.sign(offset + scaled * place[:, None])
+        inside = np.flatnonzero(place == median)
+        shares[inside, joint[inside]] = 0.0
+        rest = (shares * scaled).sum(axis=1) + after.slope[:, 0]
+        shares[inside, joint[inside]] = np.clip(-rest[inside] / scaled[inside, joint[inside]], -1.0, 1.0)
+        multiplier = self.weights * shares
+        remaining = (target.tangents[:, :, 0] * multiplier).sum(axis=1, keepdims=True) + after.slope
+        least = np.minimum(remaining * target.low, remaining * target.high)[:, 0]
+        return (multiplier * delta).sum(axis=1) + least + after.least, multiplier, place[:, None]
+
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
 
