@@ -8,7 +8,7 @@ from tests.sweep import touches
 
 
 @pytest.mark.parametrize("kind", sorted(touches.COUNTS))
-def test_no_touch_is_proven_clear(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_planted_contact_is_proven_clear(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(touches, "MOTIONS", 2)
     row = touches.result(kind, 7)
     assert row["wrong"] == []

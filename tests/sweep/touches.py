@@ -23,7 +23,7 @@ from ocp.motion.local.collisions import scene_hulls
 from scripts.timing.clearance_peers import Motion, machines, proof, random_motion
 from tests.sweep.results import Row, Sweep, parser
 
-MOTIONS, TOUCHES = 100, 10
+MOTIONS, PLANTED = 100, 10
 """Motions of a case, and touches of each."""
 COUNTS = dict.fromkeys(["seven joints", "twelve joints"], 50)
 DEPTHS_M = (1e-8, 1e-4)
@@ -96,7 +96,7 @@ def result(kind: str, seed: int) -> Row:
         rng = np.random.default_rng(number)
         motion = random_motion(robot, middle, 1 + number % 4, number)
         links, obstacles = list[str](), list[Any]()
-        for _ in range(TOUCHES):
+        for _ in range(PLANTED):
             link, point, direction = grazed_corner(kind, motion, rng)
             links.append(link)
             obstacles.append(obstacle_at(point, direction, float(np.exp(rng.uniform(*np.log(DEPTHS_M)))), rng))
@@ -107,7 +107,7 @@ def result(kind: str, seed: int) -> Row:
         planted += len(bounds)
         largest = max(largest, *bounds)
         row["wrong"] += [f"proven clear, seed {number}"] * sum(bound >= 0 for bound in bounds)
-    row["wrong"] += ["a touch has no pair"] * (planted < MOTIONS * TOUCHES)
+    row["wrong"] += ["a touch has no pair"] * (planted < MOTIONS * PLANTED)
     return row | {"seconds": time.process_time() - began, "touches": planted, "largest_bound_m": largest}
 
 

@@ -308,13 +308,14 @@ def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None
 
 
 def joint_values(
-    entries: TomlTable, name: str, default: float, expected: str = BY_JOINT, least: float | None = None
+    entries: TomlTable, name: str, default: float, allowed: tuple[str, float | None] = (BY_JOINT, None)
 ) -> Any:
     """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
 
-    Joints without a number get `default`. If `least` is given, all numbers are above it, and the entry may also be one
-    number for all joints, which is returned as it is.
+    Joints without a number get `default`. `allowed` are the expected values in words, and the number that all are
+    above. If there is such a number, the entry may also be one number for all joints, which is returned as it is.
     """
+    expected, least = allowed
     if name not in entries:
         return None
     if least is not None and not isinstance(entries.raw(name), dict):

@@ -127,7 +127,7 @@ TASK: Readers = TIP | {
 }
 PACE: Readers = {"acceleration": (_speed, "m/s^2"), "jerk": (_speed, "m/s^3"), "centripetal": (_speed, "m/s^2")}
 WAYPOINTS: Readers = {
-    "step": (joint_values, np.inf, f"a number above 0, rad or m, {BY_JOINT}", 0.0),
+    "step": (joint_values, np.inf, (f"a number above 0, rad or m, {BY_JOINT}", 0.0)),
     "reconfigurations": (TomlTable.choice, ("forbidden", "counted")),
 }
 STEPS: Readers = {
@@ -142,7 +142,7 @@ CONE: Readers = {
     "depth": (TomlTable.positive, "m"),
 }
 FRICTION: Readers = {
-    **dict.fromkeys(("viscous", "coulomb"), (joint_values, 0.0, WEIGHT, -1e-300)),
+    **dict.fromkeys(("viscous", "coulomb"), (joint_values, 0.0, (WEIGHT, -1e-300))),
     "slip": (TomlTable.positive, "rad/s or m/s"),
 }
 CAPTURE: Readers = {
@@ -169,19 +169,19 @@ ZMP_RULES: Readers = {
 }
 LIMITS: Readers = {
     "joints": (lambda entries, name: entries.flag("positions", True),),
-    "velocity": (joint_values, np.inf, f"a number above 0, rad/s or m/s, {BY_JOINT}", 0.0),
-    "acceleration": (joint_values, np.inf, f"a number above 0, rad/s^2 or m/s^2, {BY_JOINT}", 0.0),
-    "jerk": (joint_values, np.inf, f"a number above 0, rad/s^3 or m/s^3, {BY_JOINT}", 0.0),
-    "torque": (joint_values, np.inf, f"a number above 0, N m or N, {BY_JOINT}", 0.0),
-    "power": (joint_values, np.inf, f"a number above 0, W, {BY_JOINT}", 0.0),
+    "velocity": (joint_values, np.inf, (f"a number above 0, rad/s or m/s, {BY_JOINT}", 0.0)),
+    "acceleration": (joint_values, np.inf, (f"a number above 0, rad/s^2 or m/s^2, {BY_JOINT}", 0.0)),
+    "jerk": (joint_values, np.inf, (f"a number above 0, rad/s^3 or m/s^3, {BY_JOINT}", 0.0)),
+    "torque": (joint_values, np.inf, (f"a number above 0, N m or N, {BY_JOINT}", 0.0)),
+    "power": (joint_values, np.inf, (f"a number above 0, W, {BY_JOINT}", 0.0)),
     "vertical_force": (TomlTable.positive, "N"),
     "friction": (TomlTable.positive, "the friction coefficient of the ground"),
     "zmp": (_zmp_rule,),
     "robust": (_uncertainties,),
 }
 COST: Readers = {
-    "weights": (joint_values, 1.0, f"a number above 0, {BY_JOINT}", 0.0),
-    **dict.fromkeys(("effort", "acceleration"), (joint_values, 0.0, WEIGHT, -1e-300)),
+    "weights": (joint_values, 1.0, (f"a number above 0, {BY_JOINT}", 0.0)),
+    **dict.fromkeys(("effort", "acceleration"), (joint_values, 0.0, (WEIGHT, -1e-300))),
     **dict.fromkeys(("velocity", "time", "length", "energy", "jerk", "turning"), (TomlTable.nonnegative, "a weight")),
 }
 SEARCH: Readers = {

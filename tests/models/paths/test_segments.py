@@ -203,7 +203,7 @@ TILTED = turned((1.0, 0, 0))
         (lambda: Path((STEP, Arc.about((1, 0, 0), (1, 1, 0), (0, 0, -1), 1.0))), "180 deg"),
         (lambda: Path((STEP, Line((1, 0, 0), (1, 1, 0), TILTED))), "orientation jumps by 57.3 deg"),
         (lambda: Path.through([(0, 0, 0)]), "expected .points, 3., 2 at least"),
-        (lambda: Path.through([(0, 0, 0), (1, 0, 0), (1, 0, 0)]), "length 0 m"),
+        (lambda: Path.through([(0, 0, 0), (0, 0, 0), (1, 0, 0)]), "length 0 m"),
         (lambda: Path.through([(0, 0, 0), (1, 0, 0), (0, 0, 0)]), "180 deg"),
         (lambda: Path.through("points"), "not numeric"),
     ],
