@@ -13,7 +13,7 @@ from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Stan
 from models.checks import Array, real
 from models.shapes.mesh_files import find_mesh
 from ocp.app.check.data_checks import CleanedTrajectory, clean_trajectory, doubtful_times, exchanged_joints
-from ocp.app.check.joint_limits import Fault, Row, RowVerdict, Rule, limit_rows, rest_row
+from ocp.app.check.joint_limits import Fault, Motion, Row, RowVerdict, Rule, limit_rows, rest_row
 from ocp.app.check.motion_checks import (
     Findings,
     check_clearance,
@@ -206,6 +206,29 @@ class CheckTolerances:
             raise ProblemError(words, name="tip_angle", value=self.tip_angle, limit=0.0)
 
 
+def _checked_machine(machine: Any) -> FixedBase | FreeFloating | Standing:
+    """Return a machine whose trajectories can be checked; a robot stands on a fixed base at the world's origin."""
+    if isinstance(machine, Robot):
+        return FixedBase(machine)
+    if isinstance(machine, FixedBase | FreeFloating | Standing):
+        return machine
+    words = f"machine must be a robot on a fixed, floating or standing base, not {machine!r}"
+    raise ProblemError(words, name="machine", value=machine)
+
+
+def _checked_bases(findings: Findings, machine: FreeFloating, motion: Motion, base: Array | None) -> Array:
+    """Return the configurations of a floating base: as given, if they conserve the momentum, or integrated."""
+    if base is None:
+        bases, rows = integrate_base(machine, motion)
+        findings.rows += rows
+        return bases
+    if (count := base.shape[1]) != machine.base_size:
+        words = f"the file gives {count} entries of the base, the machine has {machine.base_size}"
+        raise ProblemError(words, name="base", value=count, limit=machine.base_size)
+    check_momentum(findings, machine, motion, base)
+    return base
+
+
 @interruptible
 def check_trajectory(
     machine: Machine | Robot,
@@ -239,11 +262,7 @@ def check_trajectory(
     Raises:
         ProblemError, ModelError: An argument does not fit the machine, or no sample is valid.
     """
-    if isinstance(machine, Robot):
-        machine = FixedBase(machine)
-    if not isinstance(machine, FixedBase | FreeFloating | Standing):
-        words = f"machine must be a robot on a fixed, floating or standing base, not {machine!r}"
-        raise ProblemError(words, name="machine", value=machine)
+    machine = _checked_machine(machine)
     require.instance("trajectory", trajectory, RawTrajectory)
     robot, limits = machine.robot, require.instance("limits", Limits() if limits is None else limits, Limits)
     bounds = limits.bounds(machine)
@@ -272,15 +291,7 @@ def check_trajectory(
         bases = None
         if isinstance(machine, FreeFloating):
             progress("momentum")
-            if cleaned.base is None:
-                bases, base_rows = integrate_base(machine, motion)
-                findings.rows += base_rows
-            elif (count := cleaned.base.shape[1]) != machine.base_size:
-                words = f"the file gives {count} entries of the base, the machine has {machine.base_size}"
-                raise ProblemError(words, name="base", value=count, limit=machine.base_size)
-            else:
-                bases = cleaned.base
-                check_momentum(findings, machine, motion, bases)
+            bases = _checked_bases(findings, machine, motion, cleaned.base)
         elif isinstance(machine, Standing):
             progress("ground")
             check_ground(findings, machine, motion, limits.friction)

@@ -358,14 +358,7 @@ def write_robot_program(
         ProblemError: An argument is invalid, the controller has too few axes, times are less than 1 ns apart, or, for
             KRL, a joint has no velocity limit.
     """
-    if not isinstance(file, str | os.PathLike):
-        raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
-    path = Path(os.fsdecode(file))
-    kind = next((kind for kind in ROBOT_LANGUAGES if path.suffix.lower() in SUFFIXES[kind]), None)
-    if kind is None:
-        known = tuple(SUFFIXES[kind][0] for kind in ROBOT_LANGUAGES)
-        words = f"{file}: a robot program is written as {', '.join(known)}; end the name with one of these"
-        raise ProblemError(words, name="file", value=str(file), limit=known)
+    path, kind = _path_and_kind(file)
     if isinstance(motion, Plan):
         robot, motion = motion.machine.robot, motion.trajectory(period)
     elif not all(hasattr(motion, name) for name in ("names", "t", "positions")):
@@ -400,6 +393,19 @@ def write_robot_program(
         seconds = [f"{duration:.9f}" for duration in durations.tolist()]
         lines = (_urscript if kind == "urscript" else _rapid)(f"motion_{title}"[:32], remarks, points, seconds)
     write_text(file, "\n".join(lines) + "\n")
+
+
+def _path_and_kind(file: FileName) -> tuple[Path, str]:
+    """Return the path of a robot program, and the name of the language that its suffix selects."""
+    if not isinstance(file, str | os.PathLike):
+        raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
+    path = Path(os.fsdecode(file))
+    for kind in ROBOT_LANGUAGES:
+        if path.suffix.lower() in SUFFIXES[kind]:
+            return path, kind
+    known = tuple(SUFFIXES[kind][0] for kind in ROBOT_LANGUAGES)
+    words = f"{file}: a robot program is written as {', '.join(known)}; end the name with one of these"
+    raise ProblemError(words, name="file", value=str(file), limit=known)
 
 
 def _axes(language: RobotLanguage, names: Sequence[str], linear: Sequence[bool]) -> list[str]:

@@ -16,7 +16,7 @@ does not say whether w comes first or last.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -214,20 +214,23 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     ):
         extent = np.ptp(positions, axis=0).max()
         warn_of_millimetres(f"{file!s}: an extent of the waypoints of", extent, "unit")
-    axes = _axes(file, parts[AXIS], rows) if AXIS in parts else None
-    orientations = None
-    if QUATERNION in parts:
-        orientations = align_signs(_quaternions(file, parts[QUATERNION], rows))
-    elif VECTOR in parts:
-        warn_of_degrees(f"{file!s}: an angle of the waypoints of", parts[VECTOR], "rx, ry, rz")
-        orientations = align_signs(exponential(parts[VECTOR]))
-    elif axes is not None:
-        orientations = align_signs(_least_roll(file, axes, rows))
-    if QUATERNION in parts or VECTOR in parts:
-        axes = None
+    orientations, axes = _orientations(file, parts, rows)
     used_names = tuple(name for name in names if any(name in kind for kind in parts))
     lines = np.array([row.number for row in rows])
     return Waypoints(positions, orientations, axes, times, used_names, ignored, lines, str(file))
+
+
+def _orientations(
+    file: FileName, parts: Mapping[Any, Array], rows: Sequence[TableRow]
+) -> tuple[Array | None, Array | None]:
+    """Return the orientations of waypoints as quaternions, and their axes if only these are given; None without."""
+    axes = _axes(file, parts[AXIS], rows) if AXIS in parts else None
+    if QUATERNION in parts:
+        return align_signs(_quaternions(file, parts[QUATERNION], rows)), None
+    if VECTOR in parts:
+        warn_of_degrees(f"{file!s}: an angle of the waypoints of", parts[VECTOR], "rx, ry, rz")
+        return align_signs(exponential(parts[VECTOR])), None
+    return (None if axes is None else align_signs(_least_roll(file, axes, rows))), axes
 
 
 def _row_error(file: FileName, rows: Sequence[TableRow], invalid: Any, why: str, limit: Any = None) -> ProblemError:

@@ -42,7 +42,7 @@ from ocp.motion.tasks.checks import (
     clip_to_limits,
     rates_at_rest,
 )
-from ocp.motion.tasks.equations import bind
+from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -334,16 +334,21 @@ def dynamics_problem(
     if cost.energy or np.isfinite(bounds.power).any():
         running += limit_power(problem, torques * motion[2], bounds, cost)
     if equations is not None:
-        if not np.isnan(ends.first).any():
-            checked_tasks(equations, ends.base, ends.first, duration)
-        check_length(equations, ends.base, duration)
-        check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
-        constrain_tips(problem, equations, motion, (problem.time,), moving=not ends.rests[0])
+        _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
         base = "base" if machine.base_size else machine.base_home()
         setup.clearance_constraints.declare(problem, base, horizon=None if free else duration)
     problem.minimize(running=running, terminal=cost.time * final)
     return problem
+
+
+def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: Any, duration: float) -> None:
+    """Check that tasks fit the ends of a motion, and constrain the tips."""
+    if not np.isnan(ends.first).any():
+        checked_tasks(equations, ends.base, ends.first, duration)
+    check_length(equations, ends.base, duration)
+    check_rest(equations, 0.0 if ends.rests[0] else None, duration if ends.rests[1] else None)
+    constrain_tips(problem, equations, motion, (problem.time,), moving=not ends.rests[0])
 
 
 @dataclass(frozen=True, eq=False)

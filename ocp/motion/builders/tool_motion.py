@@ -103,11 +103,7 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         ProblemError: A task begins or ends outside the horizon.
     """
     slack = ROUNDING_SHARE * horizon  # closer times count as one
-    for number, task in enumerate(tasks):
-        last = task.begin if task.duration is None else task.end
-        if last > horizon + slack or task.begin > horizon - slack:
-            words = f"task {number} is from {task.begin:g} to {task.end:g} s, the motion from 0 to {horizon:g} s"
-            raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, horizon))
+    _check_times(tasks, horizon, slack)
     times = sorted({0.0, horizon, *(t for task in tasks for t in (task.begin, min(task.end, horizon)))})
     bounds = [times[0], *(t for before, t in pairwise(times) if t - before > slack and horizon - t > slack), horizon]
     stretches: list[Stretch] = []
@@ -133,6 +129,15 @@ def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> 
         new = tuple(i not in before for i in active)
         stretches.append(Stretch(begin, end, active, equations, new, breaks, nodes, suffix))
     return tuple(stretches)
+
+
+def _check_times(tasks: Sequence[TipTask], horizon: float, slack: float) -> None:
+    """Raise ProblemError for a task that begins or ends outside the horizon by more than `slack`, s."""
+    for number, task in enumerate(tasks):
+        last = task.begin if task.duration is None else task.end
+        if last > horizon + slack or task.begin > horizon - slack:
+            words = f"task {number} is from {task.begin:g} to {task.end:g} s, the motion from 0 to {horizon:g} s"
+            raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, horizon))
 
 
 @dataclass(frozen=True, eq=False)

@@ -190,33 +190,56 @@ def margin_of_plan(plan: Plan, uncertainty: Any = None, tolerance: float | None 
         raise ProblemError(words, name=missing[0], value=stated[missing[0]])
     if not names:
         return Margin({}, {}, Range(np.inf, "", np.nan, 0), {})
-    coefficients = {name: np.concatenate([row.coefficient(name) for row in rows]) for name in names}
-    slack, times = (np.concatenate([getattr(row, each) for row in rows]) for each in ("slack", "times"))
-    labels = np.repeat([row.name for row in rows], [row.slack.size for row in rows])
+    stacked = _Stacked.of(rows, names)
+    alone = {name: stacked.largest(stacked.coefficients[name], stacked.slack) for name in names}
+    sizes = {name: size for name, size in stated.items() if size is not None}
+    weights = {name: sizes.get(name, alone[name].size) for name in names}
+    together, factors = stacked.grow(weights, [*sizes])
+    moves_tip = tolerance is None and bool({BASE, TOOL} & set(names))
+    return Margin(alone, together, factors[0] if factors else alone[names[0]], sizes, moves_tip)
 
-    def largest(growth: Array, left: Array) -> Range:
+
+class _Stacked(NamedTuple):
+    """Requirements of all kinds at all M samples: sum of coefficients times sizes <= slack."""
+
+    coefficients: dict[str, Array]  # of each uncertainty, (M,)
+    slack: Array
+    times: Array
+    labels: Array
+
+    @classmethod
+    def of(cls, rows: list[Requirements], names: list[str]) -> _Stacked:
+        coefficients = {name: np.concatenate([row.coefficient(name) for row in rows]) for name in names}
+        slack, times = (np.concatenate([getattr(row, each) for row in rows]) for each in ("slack", "times"))
+        return cls(coefficients, slack, times, np.repeat([row.name for row in rows], [row.slack.size for row in rows]))
+
+    def largest(self, growth: Array, left: Array) -> Range:
         """Return the largest factor of a growth (M,) that the slacks (M,) allow, and the requirement that ends it."""
         factors = np.full(growth.shape, np.inf)
         np.divide(np.maximum(left, 0.0), growth, out=factors, where=growth > 0)
         row = int(factors.argmin())
-        return Range(float(factors[row]), str(labels[row]), float(times[row]), row)
+        return Range(float(factors[row]), str(self.labels[row]), float(self.times[row]), row)
 
-    alone = {name: largest(coefficients[name], slack) for name in names}
-    sizes = {name: size for name, size in stated.items() if size is not None}
-    weights = {name: sizes.get(name, alone[name].size) for name in names}
-    together, factors = dict.fromkeys(names, 0.0), list[Range]()
-    unstated = [name for name in names if name not in sizes]
-    for group, most in (([*sizes], 1.0 if unstated else np.inf), (unstated, np.inf)):
-        growing, factor = [name for name in group if weights[name] > 0], 0.0
-        while growing and factor < most:
-            used = np.sum([coefficients[name] * together[name] for name in names], axis=0)
-            end = largest(np.sum([coefficients[name] * weights[name] for name in growing], axis=0), slack - used)
-            step = min(end.size, most - factor)
-            together |= {name: together[name] + step * weights[name] for name in growing}
-            growing, factor = [name for name in growing if not coefficients[name][end.row] > 0], factor + step
-            factors.append(end)
-    moves_tip = tolerance is None and bool({BASE, TOOL} & set(names))
-    return Margin(alone, together, factors[0] if factors else alone[names[0]], sizes, moves_tip)
+    def grow(self, weights: Mapping[str, float], stated: list[str]) -> tuple[dict[str, float], list[Range]]:
+        """Return sizes that are allowed together, and the requirements that end their growth, one after the other.
+
+        All grow in proportion to their weights: first the stated ones, up to their weights if there are others, then
+        the others. An uncertainty stops at the first requirement that allows no more of it.
+        """
+        together, factors = dict.fromkeys(weights, 0.0), list[Range]()
+        others = [name for name in weights if name not in stated]
+        for group, most in ((stated, 1.0 if others else np.inf), (others, np.inf)):
+            growing, factor = [name for name in group if weights[name] > 0], 0.0
+            while growing and factor < most:
+                used = np.sum([self.coefficients[name] * together[name] for name in weights], axis=0)
+                growth = np.sum([self.coefficients[name] * weights[name] for name in growing], axis=0)
+                end = self.largest(growth, self.slack - used)
+                step = min(end.size, most - factor)
+                together |= {name: together[name] + step * weights[name] for name in growing}
+                growing = [name for name in growing if not self.coefficients[name][end.row] > 0]
+                factor += step
+                factors.append(end)
+        return together, factors
 
 
 def checked_uncertainty(value: Any) -> dict[str, float | None]:
