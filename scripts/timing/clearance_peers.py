@@ -42,6 +42,8 @@ DISTANCES_M = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6)
 TIMED_M = 1e-2
 """Smallest distance of the scenes whose proofs are timed."""
 OBSTACLES = 6
+HALVINGS = 60
+"""Largest number of bisections of the line on which an obstacle is moved: its share is then exact to rounding."""
 ROOM_M = 0.15
 """Distance from the motion of obstacles other than the nearest one."""
 TUBE = 1e-3
@@ -323,7 +325,7 @@ def with_nearest(motion: Motion, boxes: list[Box], distance: float) -> Collision
     link, obstacle = first.points if first.bodies[1] == "obstacle 0" else first.points[::-1]
     step = link - obstacle
     low, high = 0.0, 1.0
-    while True:
+    for _ in range(HALVINGS):
         share = (low + high) / 2
         moved = dataclasses.replace(boxes[0], position=boxes[0].position + share * step)
         scene = CollisionScene(FixedBase(motion.robot), [moved, *boxes[1:]])
@@ -331,6 +333,7 @@ def with_nearest(motion: Motion, boxes: list[Box], distance: float) -> Collision
         if abs(nearest - distance) <= 0.01 * distance:
             return scene
         low, high = (share, high) if nearest > distance else (low, share)
+    raise RuntimeError(f"no place of the obstacle is {distance:g} m from the motion")
 
 
 def run_peers(repeats: int) -> list[dict[str, Any]]:
@@ -450,7 +453,7 @@ def certify_tube(motion: Motion, scene: CollisionScene, queue: Any) -> None:
         success, _ = free.FindSeparationCertificateGivenPolytope(normals, sides, set(planes) - {ids}, options)
         count += bool(success)
         queue.put((count, time.process_time() - began, ids == order[-1]))
-    del diagram
+    del diagram  # it owns the plant and had to live until here
 
 
 def body_name(inspector: Any, geometry_id: Any) -> str:

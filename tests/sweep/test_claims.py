@@ -181,3 +181,18 @@ def test_pages_repeat_the_captions_of_their_figures() -> None:
     )
     assert shares == [round(1 / (1 - saved / 100), 1), round(most / least, 1)]
     assert more == 0.0
+
+
+def test_the_page_of_clearance_has_the_times_of_the_rows() -> None:
+    with (ROOT / "results" / "benchmark" / "clearance_peers.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    names = {"seven joints": "7 joints", "twelve joints": "two arms, 12 joints"}
+    for row in rows:
+        pattern = rf"\| {names[row['robot']]} \| (\d+) \| {row['degree']} \| ([\d.]+) s \| ([\d.]+) s \|"
+        numbers = [float(row["pairs"]), round(float(row["ours_s"]), 2), round(float(row["squares_s"]), 1)]
+        assert claimed("docs/tutorials/clearance.md", pattern) == numbers
+        assert row["pairs"] == row["ours_pairs"] == row["squares_pairs"]
+        assert float(row["ours_least_m"]) == float(row["squares_least_m"]) == 1e-6
+    regions = [(int(row["iris_pairs"]), float(row["iris_s"])) for row in rows if row["iris_pairs"]]
+    for count, spent in regions:
+        assert claimed("docs/tutorials/clearance.md", rf"\| {count} pairs in (\d+) s \|") == [spent]
