@@ -1,4 +1,4 @@
-"""Sample a motion for display; the motion is a plan, the solution of any problem, or any joint trajectory.
+"""Sample plans, solutions of optimal control problems, and joint trajectories for display.
 
 Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as known.
 """
@@ -68,7 +68,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Corners (k, 2), m, of the contact area, and zero moment points (M, 2), m, with or without external forces."""
+    """Corners (k, 2) of the contact area, and zero moment points (M, 2), m; `forces` if these count external forces."""
 
     corners: Array
     points: Array
@@ -348,8 +348,9 @@ def _animation(
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
-    costs = [one for one in own_curves if one.group == "Cost"]
-    curves += [one for one in costs if abs(one.values[-1] - effort[-1]) > relative * max(abs(effort[-1]), 1e-12)]
+    costs = [curve for curve in own_curves if curve.group == "Cost"]
+    least = relative * max(abs(effort[-1]), 1e-12)
+    curves += [cost for cost in costs if abs(cost.values[-1] - effort[-1]) > least]
     curves += machine_curves(machine, samples)
     closest = details.get("closest")
     if closest is not None:
@@ -357,7 +358,7 @@ def _animation(
         curves.append(Curve("The motion", "closest two bodies", "m", distances, float(closest.required.min())))
     footing = None
     if isinstance(machine, Standing) and samples.accelerations is not None:
-        inside = [one for one in own_curves if one.group == ZMP_CONSTRAINT]
+        inside = [curve for curve in own_curves if curve.group == ZMP_CONSTRAINT]
         footing, more = ground_contact(machine, samples, inside)
         curves += more
     curves += joint_curves(machine, Limits().bounds(machine), samples)

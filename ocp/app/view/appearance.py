@@ -90,7 +90,7 @@ class Appearance:
 def appearance_of(
     robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """Return the surfaces with which the links of a robot are displayed, modified or not: shapes move with their links.
+    """Return the surfaces with which the links of a robot are displayed, also if the robot was modified after reading.
 
     `folders` are searched first for `meshes`, which are read if that is set. If there are more than `most` faces,
     nearby corners are merged.

@@ -69,7 +69,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of curves, see `limits_in_view`."""
+    """Draw the limits of the curves in a diagram as lines or, if they are distant, as text."""
     view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range=min_range)
     for limit in view.lines:
         ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
@@ -255,9 +255,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s), in the interval of its phase, and values of each state and control by name, with both one-sided
-    values at nodes.
-    """
+    """Return times, s, and values of each state and control by name; jumps at nodes have the values of both sides."""
     if isinstance(motion, LocalSolution):
         return {name: (motion.t, values) for name, values in _local(motion).items()}
     nodes = motion.control_interpolant.breaks[1:-1]
@@ -298,7 +296,7 @@ def _motions_by_name(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new matplotlib figure, or a given figure after checking that it is empty, of a size in inches."""
+    """Return a new matplotlib figure of a size in inches, or resize a given figure, which must be empty."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)
