@@ -194,8 +194,8 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
 class Attempt(NamedTuple):
-    """Result of one solve: plan or last iterate, why it is no plan, and whether this is only that inequalities are
-    exceeded between the points of the grid.
+    """Result of one solve: plan or last iterate, the error that rejects it, and whether that reports only violations
+    of inequalities between the points of the grid.
     """
 
     solution: Solution | None
@@ -366,7 +366,7 @@ def _audited(
     problem: Problem,
     run: Callable[[], Solution],
 ) -> Attempt:
-    """Run a solver and audit the plan; `pose_error` rejects plans that pass but leave their tasks."""
+    """Run a solver and audit the plan; `pose_error` rejects plans that pass but deviate from their tasks."""
     try:
         solution = run()
     except SolveError as error:

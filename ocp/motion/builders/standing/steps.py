@@ -254,7 +254,7 @@ def _over_support(stance: Stance, joints: Any) -> Any:
 
 
 def _at_random(rows: Any, joints: Any) -> Array:
-    """Return the values of rows at three random configurations and values of their other symbols. Shape (k, 3)."""
+    """Evaluate expressions at three random joint positions, with random values of all other symbols. Shape (k, 3)."""
     rng = np.random.default_rng(0)
     own = ca.vertsplit(joints)
     others = [symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in own)]
@@ -320,7 +320,7 @@ class StepsMotion:
         return np.where(self.held(foot)[:, None], points, np.nan)
 
     def friction(self, foot: str) -> Array:
-        """Return the tangential over the normal force of a foot, which friction bears; nan in the air. Shape (M,)."""
+        """Return the ratio of the tangential to the normal force on a foot; nan in the air. Shape (M,)."""
         _, force = self._load_in_sole(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
