@@ -217,7 +217,7 @@ def check_ground(findings: Findings, machine: Standing, motion: Motion, friction
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Return the configurations (M, base_size) of a floating base at the samples of a joint motion, and rows about it.
+    """Integrate the motion of a floating base; return its configurations (M, base_size) at the samples, and table rows.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.

@@ -114,7 +114,7 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """Read joint states or trajectories from an MCAP log; return the topic, and time stamp (ns) and fields of messages.
+    """Read joint states or trajectories from an MCAP log; return the topic, and stamp (ns) and fields of each message.
 
     A stamp is that of the message's header, or the log time if the header's is zero. By default, the topic is the only
     one with messages of these types or, if there are several, `/joint_states`.

@@ -165,13 +165,13 @@ class TomlTable:
         return {key: float(value) for key, value in table._values.items()}
 
     def values(self, readers: Readers) -> dict[str, Any]:
-        """Return the existing entries among those that `readers` names, each read by its function, by name."""
+        """Return those entries named in `readers` that the table has, by name, each read by its function."""
         values = {name: read(self, name, *arguments) for name, (read, *arguments) in readers.items()}
         return {name: value for name, value in values.items() if value is not None}
 
-    def build(self, kind: Callable[..., T], readers: Readers, **others: Any) -> T:
+    def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
         """Call `kind` with the entries of the table and other arguments; errors that `kind` raises name the line."""
-        values = self.values(readers) | others
+        values = self.values(readers) | arguments
         self.done()
         with located_errors(self):
             return kind(**values)
@@ -390,10 +390,10 @@ SHAPES: dict[str, tuple[type, Readers]] = {
 def read_shape(table: TomlTable, folder: Path = Path(), kinds: Iterable[str] = SHAPES) -> Any:
     """Return the shape that a table describes; names of mesh files are relative to `folder`."""
     kind, readers = SHAPES[table.choice("shape", kinds, REQUIRED)]
-    others = (
+    arguments = (
         {"file": folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)} if kind is Mesh else {}
     )
-    return table.build(kind, readers, **others)
+    return table.build(kind, readers, **arguments)
 
 
 def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:

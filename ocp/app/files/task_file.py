@@ -381,10 +381,10 @@ def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
 
 def _goal(entries: TomlTable, folder: Path, machine: Machine) -> Goal:
     """Read the table [goal] of a task file and return the goal."""
-    others: dict[str, Any] = {"tasks": _motion(entries, "path", folder, machine)} if "path" in entries else {}
+    arguments: dict[str, Any] = {"tasks": _motion(entries, "path", folder, machine)} if "path" in entries else {}
     if "load" in entries:
-        others["machine"] = replace(machine, robot=_loaded(entries, machine.robot))  # type: ignore[type-var]
-    return entries.build(Goal, GOAL, **others)
+        arguments["machine"] = replace(machine, robot=_loaded(entries, machine.robot))  # type: ignore[type-var]
+    return entries.build(Goal, GOAL, **arguments)
 
 
 def _waypoints(entries: TomlTable, folder: Path, machine: Machine) -> Waypoints:

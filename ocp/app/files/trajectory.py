@@ -63,7 +63,7 @@ class RawTrajectory:
     """Joint trajectory as it is written in a file, faults included.
 
     Attributes:
-        names: Names of the joints. The columns of a table may be something else, which the table does not say.
+        names: Names of the joints; some may be columns of other quantities whose names a table does not explain.
         t: Times as written, s. Shape (M,).
         positions, velocities, accelerations, efforts: Shape (M, n), rad or m, per s, per s^2, N m or N. nan if a value
             is missing, None if all are.
@@ -104,7 +104,7 @@ def read_trajectory(
         columns: Names of the columns of a table without a header.
         period: Sampling period, s, of a table without times, or of a KRL program, which has none.
         topic: Topic of an MCAP with several.
-        joints: Names that are joints even if they look like something else.
+        joints: Names of columns that are joints even if the names look like other quantities.
         kind: "csv", "json", "yaml", "mcap", "urscript", "krl" or "rapid"; None: by the suffix of the name.
 
     Raises:

@@ -309,7 +309,7 @@ def animate_solution(
     details |= _audit_verdict([solution], lambda: solution.audit(**settings))
     times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
     details["closest"] = _closest_pairs([(solution, "", times_of_pairs)], solution.horizon)
-    smooth = _torque_like(solution, joints)
+    smooth = _is_smooth(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
     samples = MotionSamples(times, q, v, a if smooth else None, base_path, base_rates)
     return _animation(name, machine, samples, own_curves, **details)
@@ -372,7 +372,7 @@ def _times(horizon: float) -> Array:
     return np.linspace(0.0, horizon, count + 1)
 
 
-def _torque_like(solution: Solution, joints: str) -> bool:
+def _is_smooth(solution: Solution, joints: str) -> bool:
     """Return whether the joint positions of a solution are smooth enough for inverse dynamics."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]
