@@ -271,7 +271,7 @@ def _first_within_limits(
     begin: Guess,
 ) -> Solution:
     """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
-    of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a plan.
+    of least cost; raise SolveError if there is none, or if a plan fails only because of collisions.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin

@@ -296,7 +296,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
     """Return the number of parts into which to split each mesh interval, from its limit violation and its integration
-    error; both decrease with the square of its length.
+    error; both decrease with the square of the interval's length.
     """
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)

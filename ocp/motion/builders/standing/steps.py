@@ -257,9 +257,9 @@ def _at_random(rows: Any, joints: Any) -> Array:
     """Evaluate expressions at three random joint positions, with random values of all other symbols. Shape (k, 3)."""
     rng = np.random.default_rng(0)
     own = ca.vertsplit(joints)
-    others = [symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in own)]
-    function = ca.Function("rows", [joints, ca.vertcat(ca.DM(0, 1), *others)], [rows])
-    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(others))) for _ in range(3)]
+    free = [symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in own)]
+    function = ca.Function("rows", [joints, ca.vertcat(ca.DM(0, 1), *free)], [rows])
+    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(free))) for _ in range(3)]
     return np.column_stack([np.array(value).ravel() for value in samples])
 
 
