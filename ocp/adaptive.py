@@ -44,7 +44,7 @@ class AdaptiveCollocation:
             integration error.
         max_intervals: Maximum number of intervals.
         progress: As of :func:`ocp.motion.plan.plan`: a function that is called with the name of each stage, True for a
-            line on the terminal, False for nothing; None shows the line after two seconds.
+            line on the terminal, False for no report; None shows the line after two seconds.
 
     Raises:
         ProblemError: accuracy is not between 0 and 1, or max_intervals is smaller than that of the finest

@@ -64,7 +64,7 @@ class Switches(NamedTuple):
 
 
 def locate_switches(problem: Problem, solution: Solution) -> Switches:
-    """Return where limits of a plan become active or inactive, and the mesh intervals over which it smears them.
+    """Return the switches of a plan, where limits become active or inactive, and the mesh intervals that smear them.
 
     ``solution`` is a plan of ``problem`` by collocation with controls at the points.
     """

@@ -383,7 +383,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
-        """Return the cost up to which charts can be halved within memory; -inf if charts are too small or too many."""
+        """Return the path cost up to which charts are halved, as memory permits; -inf if splitting must end."""
         costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
         if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
             return -np.inf

@@ -307,7 +307,7 @@ def choose_samples(
 def lower_bound_along(
     problem: PathProblem, path: Array, loss: float, *, seeds: Callable[[int], Array], settings: SearchSettings
 ) -> float:
-    """Return a lower bound of the cost of all paths, from those samples that a path of low cost shows to be needed.
+    """Return a lower bound of the cost of all paths, from few samples chosen along a path of low cost.
 
     The bound is what the time limit and the largest number of charts allow. It is 0, with a warning, if even large
     charts are too many.
