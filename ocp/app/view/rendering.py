@@ -381,7 +381,7 @@ class _Sun:
 def _draw_floor(
     picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None, bare: NDArray[np.intp]
 ) -> None:
-    """Draw the floor and the shadows on it at the samples `bare` of a picture, which no surface covers."""
+    """Draw the floor and the shadows on it at those samples of a picture, `bare`, that no surface covers."""
     ray, eye = camera.rays(bare), camera.eye.astype(np.float32)
     depth = np.float32(floor.height - camera.eye[2]) / ray[:, 2]
     x, y = (eye[k] + depth * ray[:, k] for k in range(2))

@@ -416,7 +416,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Return the shortened path along the least cost-to-go bound; None if it breaks off or makes too long steps."""
+        """Shorten the path along the least cost-to-go bound; return None if it breaks off or has too long steps."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 

@@ -132,7 +132,7 @@ class PathProblem:
 
     @property
     def dimension(self) -> int | None:
-        """Dimension of the manifolds; None if they differ in it."""
+        """Dimension of the manifolds; None if their dimensions differ."""
         sizes = {sample.manifolds.size for sample in self.samples}
         return sizes.pop() if len(sizes) == 1 else None
 

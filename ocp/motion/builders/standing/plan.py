@@ -194,8 +194,8 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
 class Attempt(NamedTuple):
-    """Result of one solve: plan or last iterate, the error that rejects it, and whether that reports only violations
-    of inequalities between the points of the grid.
+    """Result of one solve: plan or last iterate, the error that rejects it, and whether the error reports only
+    violations of inequalities between the points of the grid.
     """
 
     solution: Solution | None

@@ -201,7 +201,7 @@ def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:
 
 
 def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, margin: float, limits: Limits) -> None:
-    """Constrain a foot's load to what its sole can bear; the load of a grip is not limited."""
+    """Constrain pressure, center of pressure and friction of the load on a foot; a grip has no limits."""
     if stance.feet[name].sole is None:
         return
     least = 0.0 if limits.vertical_force is None else float(limits.vertical_force)
