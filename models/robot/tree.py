@@ -70,7 +70,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Return the indices of the joints so that every joint precedes its descendants, else in the order of declaration.
+    """Return the indices of the joints in order of declaration, except that each joint precedes all its descendants.
 
     Raises:
         ModelError: Some links form a loop that is not connected to the root.
@@ -280,7 +280,7 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return the links and joints of a robot without a floating joint, for which the fixed joint `place` stands.
+    """Return a robot's links and joints without its floating joint, which `joints` contain as the fixed joint `place`.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
@@ -306,7 +306,7 @@ def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint
 def _replace_by_chain(
     place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
 ) -> Parts:
-    """Return a robot with one joint replaced by several; `steps` has suffix of the name, kind and axis of each."""
+    """Return a robot with one joint replaced by several; `steps` states name suffix, kind and axis of each of these."""
     new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
     ends = [place.parent, *(link.name for link in new_links), place.child]
     chain = [
