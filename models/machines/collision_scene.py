@@ -141,7 +141,7 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the machine with some joints locked, without pairs that then cannot move relatively.
+        """Return the scene of the machine with some joints locked, without pairs that then keep their distance.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Pairs of links, named "A and B", unchecked because they seem to collide always; the reason for each pair."""
+        """Reason for each pair of links, named "A and B", that is not checked because it seems to collide always."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -318,7 +318,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative velocity of each pair of bodies; ModelError for a prismatic joint without limits."""
+        """Bounds on the relative velocity of each pair; raises ModelError for a prismatic joint without limits."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -351,7 +351,7 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies that are checked by convex hulls of meshes instead of covers, grouped by mesh.
+        """Return pairs of bodies that are checked by convex hulls of meshes, not covers, grouped by pair of meshes.
 
         They have at most three joints between them and may be closer by design than the covers of their meshes allow,
         or their covers always collide.
@@ -427,7 +427,7 @@ def _pair(value: Any, number: int) -> tuple[str, str]:
 
 
 def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[int, int]]], rounding: float) -> Any:
-    """Return the Function of `CollisionScene.distance_gradients` for groups of pairs, indices of two bodies.
+    """Return the CasADi Function of `CollisionScene.distance_gradients` for groups of pairs of body indices.
 
     Each distance is the minimum over one group.
     """
