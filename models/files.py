@@ -65,7 +65,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: no regular file, too large, or one that other users own or may change."""
+    """Error about a file that is not read: it is not regular, is too large, or other users own or may change it."""
 
     value: int | None = None  # size of a file that is too large, bytes; else None
     limit: int | None = None  # largest size that is read, bytes; else None
@@ -223,7 +223,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key, a SHA-256 digest, of a result of a version of the code from given arrays and strings."""
+    """Return the cache key, a SHA-256 digest, of a result that a code version computes from arrays and strings."""
     digest = hashlib.sha256(version.encode())
     for content in contents:
         data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)

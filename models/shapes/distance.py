@@ -160,7 +160,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from n pairs of shapes to their distances and, as wrenches, the gradients of these.
+    """Return the CasADi Function from n pairs of shapes to their distances and the distances' gradients, as wrenches.
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
@@ -294,7 +294,7 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one a mesh or cylinder; `poses` are their rotations and positions."""
+    """Return the signed distance of two shapes, one a mesh or cylinder, at `poses` (rotation and position of each)."""
     one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
     if isinstance(one, PlaneCore):
         gap = _least_height(other, one.normal, one.point, rounding)

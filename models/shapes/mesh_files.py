@@ -238,7 +238,7 @@ def _merge_vertices(corners: Array) -> Triangles:
 
 
 def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first indices of the distinct rows of a table in ascending order, and for each row its distinct one.
+    """Return the index of each distinct row of a table, in ascending order of rows, and each row's number among them.
 
     Several times faster than `np.unique` with an axis.
     """
