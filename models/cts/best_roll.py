@@ -96,7 +96,7 @@ class Evaluation(NamedTuple):
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2, of joint angle 2, at which a constraint is active, and a lower bound of the cost near it.
+    """A value of cos q2 (joint angle 2) at which a constraint is active, and a lower bound of the cost near it.
 
     `side` is as in RoughRoll.
     """
@@ -114,7 +114,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Rig's inverse kinematics for one target: joint positions (6, 1), cost, codes of active constraint and status."""
+    """Inverse kinematics solution: joint positions (6, 1) of the rig, cost, codes of active constraint and status."""
 
     joints: Expression
     cost: Expression

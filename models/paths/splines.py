@@ -148,12 +148,12 @@ class Spline:
 
     @property
     def start_orientation(self) -> Array | None:
-        """Tool orientation at the spline's start, unit quaternion; None if it states none. Shape (4,)."""
+        """Tool orientation at the spline's start, unit quaternion; None if not specified. Shape (4,)."""
         return self._orientation(0, np.array([1.0, 0, 0, 0, 0, 0]))
 
     @property
     def end_orientation(self) -> Array | None:
-        """Tool orientation at the spline's end, unit quaternion; None if it states none. Shape (4,)."""
+        """Tool orientation at the spline's end, unit quaternion; None if not specified. Shape (4,)."""
         return self._orientation(-1, np.ones(6))
 
     def _orientation(self, piece: int, powers: Array) -> Array | None:
@@ -219,7 +219,7 @@ FIT = FitSettings()
 
 
 def fit_spline(line: Polyline, deviation: float, angle: float, max_pieces: int) -> tuple[Spline, float] | None:
-    """Fit a spline to a polyline, whose ends it meets; return it with a bound of its deviation, m, or None.
+    """Fit a spline to a polyline, exactly at its ends; return it and a bound of its deviation, m, or None.
 
     Args:
         deviation: Largest distance (m) between points of equal parameter of polyline and spline.
