@@ -205,7 +205,7 @@ class Chain:
         return positions, rotations.reshape(-1, 3, 3)
 
     def random_configurations(self, count: int, seed: int) -> tuple[Array, Motion]:
-        """Return random joint positions (count, n), up to pi or the size of the arm, and the poses of the tip there."""
+        """Return random joint positions (count, n), within pi rad or the arm's size, and the tip poses there."""
         joints = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, len(self.axes)))
         joints[:, ~self.revolute] *= self.size / np.pi
         positions, rotations = self.poses(joints)
@@ -253,8 +253,8 @@ class Chain:
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the IK solutions of goal poses without duplicates, ordered by pose, with angles from -pi to pi; they
-        are distinguished by the joints with given indices.
+        """Return the IK solutions of goal poses, ordered by pose, with angles from -pi to pi and without duplicates,
+        which agree in the joints with given indices.
         """
         pose, joints, singular = solutions
         free = np.array(numbers, dtype=int)
@@ -277,7 +277,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
+    """Return index pairs of IK solutions of the same pose, from the increasing pose index of each. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return np.triu_indices(len(pose), 1)
     first = np.arange(len(pose))[:, None]

@@ -211,7 +211,7 @@ class _Model:
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
     def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator over any one interval between samples; its parameters are start time and duration, s."""
+        """Return an integrator over one interval between samples; its parameters are start time and duration, s."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)

@@ -50,7 +50,7 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target poses of all pose tasks in world along a motion, since some are relative to a link.
+    """Return the target poses of all pose tasks along a motion, in world, also of tasks relative to a link.
 
     Args:
         times: Times on the clock of the tasks, s. Shape (M,).
@@ -84,7 +84,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return those of the breaks (k,) of targets that a mesh needs as nodes to represent them, both ends included.
+    """Return the breaks (k,) of targets, including both ends, that a mesh needs as nodes to represent the targets.
 
     Intervals are bisected at the break nearest to their middle until the interpolants of the targets deviate by no more
     than `NODES` allows. A path of many short segments thus needs no more nodes than a smooth path of the same shape.

@@ -128,7 +128,7 @@ def checked_speed(speed: Any) -> float:
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return the functions of time of a tool that moves along a path; in builders they need symbols=casadi.MX.
+    """Return functions of time for a tool that moves along a path; builders that use them need symbols=casadi.MX.
 
     The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
@@ -212,8 +212,7 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a target, a constant or a function of CasADi time since its begin, as a dense expression of the symbol
-    `time`.
+    """Return a target, a constant or a function of the time since its begin, as a dense expression of `time`.
 
     Raises:
         ProblemError: Another shape than those allowed, a value that is not finite, or an expression of anything but the
