@@ -457,7 +457,7 @@ class Search:
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function that reports an infeasible target by joint positions nan and the reason as status."""
+        """Return the Function that reports an infeasible target: joint positions nan, and the reason as status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))

@@ -75,7 +75,7 @@ class Candidate(NamedTuple):
 
 
 class ConstraintCheck(NamedTuple):
-    """Boolean expressions that tell which reach constraints and joint limits are satisfied at a roll angle."""
+    """Boolean expressions that state which reach constraints and joint limits are satisfied at a roll angle."""
 
     pitch: Expression
     yaw: Expression
@@ -119,7 +119,7 @@ def limit_code(joint: int, upper: bool) -> int:
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1, a squared distance from the tunnel's centre, as harmonics of the roll angle.
+    """Return the cost index I1, a squared distance from the tunnel's centre, as a polynomial of roll harmonics.
 
     Equation (36) of Lee, Lee 2017.
     """

@@ -474,7 +474,7 @@ def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[i
 
 
 def _motion_signs(scene: CollisionScene, pairs: Array, joints: Sequence[str]) -> Array:
-    """Return 1 where a coordinate moves only the first body of a pair, -1 only the second, else 0. Shape (n, k)."""
+    """Return 1 where a coordinate moves only a pair's first body, -1 where only its second, else 0. Shape (n, k)."""
     size, carriers = scene.machine.base_size, scene._carriers
     carried = np.zeros((len(scene.bodies), size + len(joints)))
     for k, body in enumerate(scene.bodies):

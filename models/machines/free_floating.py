@@ -126,7 +126,7 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian (25), which maps joint rates to the tip's twist minus its drift. Shape (6,
+        """Return the generalized Jacobian, eq. (25), which maps joint rates to tip twist minus drift. Shape (6,
         joint_size).
         """
         return self._tip_motion(base, self._reaction(q, None, tip=True))
@@ -139,7 +139,7 @@ class FreeFloating:
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the base twist E1^-1 (momentum - E2 joint_rates), (24) of Kim and Kim 2011. Shape (6, 1) or (3, 1)."""
+        """Return the base twist E1^-1 (momentum - E2 joint_rates), eq. (24) of Kim and Kim 2011. Shape (6 or 3, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
@@ -223,9 +223,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion, given by its rates, minus the conserved momentum; zero for every possible
-        motion.
-        """
+        """Return the momentum at given rates minus the conserved momentum, zero for every possible motion."""
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
         if carried is None:

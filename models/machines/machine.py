@@ -169,7 +169,7 @@ class FixedBase:
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the machine with its tip at another frame, which is fixed in any of its links.
+    """Return the machine with its tip at another frame, which is fixed in one of its links.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.

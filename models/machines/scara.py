@@ -169,9 +169,7 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from tool pose (x, y, z, yaw) and three derivatives to joints and three
-        derivatives.
-        """
+        """Return the CasADi Function from pose (x, y, z, yaw) and three derivatives to joint positions and theirs."""
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
         pose = inputs[0] + at * (inputs[1] + at * (inputs[2] / 2 + at * inputs[3] / 6))

@@ -72,7 +72,7 @@ class Foot:
 
     @cached_property
     def corners(self) -> Array:
-        """Corners of the sole in the sole's frame; only the origin of that frame for a grip. Shape (k, 3), m."""
+        """Corners of the sole in the sole's frame; for a grip, the origin of that frame alone. Shape (k, 3), m."""
         if self.sole is None:
             return np.zeros((1, 3))
         plane = np.asarray(self.sole.vertices)

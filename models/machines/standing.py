@@ -156,7 +156,7 @@ class Standing(FixedBase):
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return condition (18) of Yoo et al. 2004, which fixes the zero moment point at `point`, (2,), m; its C has
+        """Return condition (18) of Yoo et al. 2004, which fixes the zero moment point at `point`, (2,), m, under
         `wrenches`.
         """
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())

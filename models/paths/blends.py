@@ -180,7 +180,7 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return angles (rad) between two lines, and the best shape factors divided by the distance of the blend's ends."""
+    """Return angles (rad) between two lines, and the best shape factors divided by the distance between blend ends."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])

@@ -257,7 +257,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return segments as a tuple; raise a ModelError if there are none or one is no segment."""
+    """Return segments as a tuple; raise a ModelError if the list is empty or an entry is no segment."""
     try:
         check_entries(segments)
         checked = tuple(segments)

@@ -192,7 +192,7 @@ class SplineTable(NamedTuple):
 
 
 def _between(coefficients: Array, first: Array, last: Array) -> Array:
-    """Return polynomial curves reparametrised so that 0 to 1 is the part from `first` to `last`. Shape (P, 6, 3)."""
+    """Return polynomial curves whose parameters 0 to 1 span the part from `first` to `last`. Shape (P, 6, 3)."""
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
     matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
@@ -277,7 +277,7 @@ def _pieces(curve: scipy.interpolate.BSpline, knots: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _bernstein() -> Array:
-    """Return the matrix from values at six equidistant points to Bernstein coefficients of degree 5. Shape (6, 6)."""
+    """Return the matrix, (6, 6), that maps values at six equidistant points to Bernstein coefficients of degree 5."""
     u, k = np.linspace(0, 1, FIT.degree + 1)[:, None], np.arange(FIT.degree + 1)
     return np.linalg.inv(scipy.special.comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
 

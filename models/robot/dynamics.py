@@ -292,7 +292,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return angular (about the world's origin) and linear momentum of bodies that move with one twist."""
+        """Return the angular (about the world's origin) and linear momentum of the bodies for a common twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -371,7 +371,7 @@ def momentum_rate(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the time derivative of the robot's angular momentum about a fixed point and linear momentum. Shape (6, 1).
+    """Return the rate of change of the robot's angular momentum about a fixed point and of its linear momentum, (6, 1).
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """

@@ -78,7 +78,7 @@ def checked_placement(placement: Placement | None, label: str = "world_from_base
 
 
 def expand_joint_vector(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
-    """Return a joint vector's entries by name for all moving joints; a mimic joint has a multiple of another's.
+    """Return a joint vector's entries by name for all moving joints; a mimic joint's is a multiple of another joint's.
 
     Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """
@@ -87,7 +87,7 @@ def expand_joint_vector(robot: Robot, vector: Expression, what: str = "q") -> di
 
 
 def reduce_to_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
-    """Convert values of all moving joints, by name, of a quantity such as torque to entries of the joint vector.
+    """Convert a quantity such as torque from values of all moving joints, by name, to entries of the joint vector.
 
     An entry is the joint's own value plus, for each joint that mimics it, the multiplier times the mimic's value.
     """

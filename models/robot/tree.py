@@ -25,7 +25,7 @@ from models.spatial import least_rotation
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
-    """Raise ModelError if a name of a link or joint occurs twice among given names."""
+    """Raise ModelError if a name of a link or joint occurs more than once."""
     for name, count in Counter(names).items():
         if count > 1:
             message = f"{kind} name {name!r} is used more than once; give every {kind} its own name"

@@ -47,7 +47,7 @@ def keep_gradient(value: Expression) -> Expression:
 
 
 def triple(entries: Iterable[Expression]) -> Triple:
-    """Return three entries as a tuple (x, y, z)."""
+    """Return the three entries of a vector as a tuple (x, y, z)."""
     x, y, z = entries
     return x, y, z
 

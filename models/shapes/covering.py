@@ -58,7 +58,7 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes."""
+    """A capsule or box that, alone or with others, covers a mesh, and how far it protrudes from the mesh."""
 
     shape: CoverShape  # capsule or box in the frame of the mesh
     overhang: float  # largest distance of sampled surface points of the shape from the convex hull of the mesh, m

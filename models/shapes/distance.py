@@ -316,7 +316,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the point, segment, box or plane of distance formulas from the column of numbers of a shape."""
+    """Convert the column of numbers of a shape to the point, segment, box or plane that distance formulas use."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -389,7 +389,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return a segment, box or hull of distance formulas in the coordinates of a frame with given centre and axes."""
+    """Transform a segment, box or hull of distance formulas to coordinates of a frame with given centre and axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

@@ -261,7 +261,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the matrices (M, 3, 12, 12) that 1, cos h and sin h multiply in the problem of the eigenvalue angle h."""
+    """Return the matrices (M, 3, 12, 12) that 1, cos h and sin h multiply in the eigenvalue problem of an angle h."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))

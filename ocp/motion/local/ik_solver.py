@@ -214,7 +214,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class ArmSolver:
-    """Solver of all inverse kinematics solutions of an arm within its limits and of partly free orientations."""
+    """Solver of an arm's inverse kinematics within limits, on all branches and for partly free orientations."""
 
     chain: Chain
     solvers: tuple[PoseSolver, ...]  # for several choices of the sampled joints, the best-conditioned one first

@@ -252,7 +252,7 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
 
 
 def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
-    """Return whether all tasks prescribe rest at a time, s; without tasks (None), there is no motion."""
+    """Return whether all tasks prescribe rest at a time, s; True if there are no tasks (None)."""
     return equations is None or not any(_moving_tasks(equations, time))
 
 

@@ -68,7 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text, with given time units of pose and of velocity tasks."""
+        """Return the units of the task equations as text, with the given suffixes for pose and velocity tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []

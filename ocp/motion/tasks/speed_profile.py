@@ -108,7 +108,7 @@ class SpeedProfile:
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return a CasADi Function from time (s), clipped, to distance, speed, acceleration and jerk."""
+        """Return a CasADi Function from time (s), clipped to the motion, to distance, speed, acceleration and jerk."""
         time = ca.MX.sym("time")
         inside = ca.fmin(ca.fmax(time, 0.0), self.duration)
         table = np.stack([self.t[:-1], self.distance[:-1], self.speed[:-1], self.acceleration[:-1], self.jerk])

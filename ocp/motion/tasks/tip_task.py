@@ -269,7 +269,7 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world).
+    """A task, the machine whose tip is the task's frame, and one whose tip is the reference frame (None: world).
 
     The methods return expressions of the machine's base configuration and joint positions.
     """
@@ -285,8 +285,8 @@ class BoundTask(NamedTuple):
 
     @property
     def target_rows(self) -> dict[str, tuple[slice, slice]]:
-        """Rows of each target of a pose in the column of targets, and of its velocity (3 rows), by name: "position" (3
-        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), as far as given.
+        """Rows of a pose's targets in the column of targets, and of their velocities (3 rows), by name: "position" (3
+        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), if prescribed.
         """
         rows, at = dict[str, tuple[slice, slice]](), 0
         for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):

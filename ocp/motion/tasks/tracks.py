@@ -102,7 +102,7 @@ class PathTracks(NamedTuple):
     breaks: Array  # times at which segments of the path or of the speed profile meet, both ends included, (k,), s
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
-        """Return the direction (3,) of an axis of the tool frame as a function of time with a rate."""
+        """Return the direction (3,) of an axis of the tool frame as a function of time with its derivative."""
         rotation, angular_velocity = self.orientation, self.orientation.rate  # type: ignore[attr-defined]
 
         def direction(time: Any) -> Any:
