@@ -354,15 +354,15 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 
 @contextmanager
-def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
+def exclusive(key: str, poll: Callable[[], Any] = lambda: None) -> Iterator[None]:
     """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
 
-    If the lock file cannot be created, the block runs without a lock. `ask` is called every 20 ms while waiting; it may
-    raise to stop waiting.
+    If the lock file cannot be created, the block runs without a lock. `poll` is called every 20 ms while waiting and
+    may raise to stop waiting.
     """
     lock = None
     with suppress(*UNREADABLE):
-        lock = _open_locked(private_folder(make=True) / f"{key}.lock", ask)
+        lock = _open_locked(private_folder(make=True) / f"{key}.lock", poll)
     try:
         yield
     finally:
@@ -372,7 +372,7 @@ def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]
                 fcntl.flock(lock, fcntl.LOCK_UN)  # else a process forked meanwhile would keep the lock
 
 
-def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
+def _open_locked(file: Path, poll: Callable[[], Any]) -> IO[bytes]:
     """Open a lock file, creating it if necessary, and wait until this process holds the lock."""
     while True:
         stream = open(file, "ab")  # noqa: SIM115
@@ -386,7 +386,7 @@ def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
             stream.close()
             raise
         stream.close()
-        ask()
+        poll()
         time.sleep(0.02)
 
 

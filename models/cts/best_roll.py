@@ -248,7 +248,7 @@ class Search:
         """
         target, previous = _inputs(ca.MX)
         first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
-        best, more = self._cheap_ends()(target, previous, first)
+        best, more = self._closed_form_ends()(target, previous, first)
         columns = [evaluations, more]
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
@@ -267,7 +267,7 @@ class Search:
         result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
-    def _cheap_ends(self) -> Any:
+    def _closed_form_ends(self) -> Any:
         """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
 
         (target, previous, best) -> (best, evaluations).

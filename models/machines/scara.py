@@ -180,11 +180,11 @@ class Scara:
         here = ca.substitute(outputs, [at], [ca.SX(0)])
         return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
 
-    def check_reach(self, radius: float, what: str) -> None:
-        """Raise ModelError, which names `what`, unless the arm reaches points `radius` (m) from the shoulder axis."""
+    def check_reach(self, radius: float, place: str) -> None:
+        """Raise ModelError, which names `place`, unless the arm reaches points `radius` (m) from the shoulder axis."""
         if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
-                f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
+                f"scara: {place} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
                 f"{self.inner:g} to {self.outer:g} m"
             )
             raise ModelError(message, name="radius", value=radius, limit=(self.inner, self.outer))

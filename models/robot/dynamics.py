@@ -247,30 +247,30 @@ def _motions_in_links(
     rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
-    twist, push = (
+    twist, twist_rate = (
         ca.DM(6, 1) if vector is None else checked_vector(name, vector, 6, meaning)
         for vector, name in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
     )
     # angular velocity, angular acceleration, acceleration of the origin less gravity
-    spin, turning, acceleration = (
-        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], push[0:3], push[3:6] - g)
+    omega, alpha, acceleration = (
+        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], twist_rate[0:3], twist_rate[3:6] - g)
     )
-    origin = {robot.root: (spin, turning, acceleration)}
-    fields = {robot.root: (acceleration, _field(spin, turning))}
+    origin = {robot.root: (omega, alpha, acceleration)}
+    fields = {robot.root: (acceleration, _field(omega, alpha))}
     for joint in robot.joints:
         turn, position = joints[joint.name]
-        spin, turning, acceleration = origin[joint.parent]
+        omega, alpha, acceleration = origin[joint.parent]
         acceleration = acceleration + ca.mtimes(fields[joint.parent][1], position)
-        spin, turning, acceleration = (ca.mtimes(turn.T, part) for part in (spin, turning, acceleration))
+        omega, alpha, acceleration = (ca.mtimes(turn.T, part) for part in (omega, alpha, acceleration))
         if joint.moves:
-            rate, push = (constant(joint.axis) * part[joint.name] for part in (rates, accelerations))
+            rate, joint_acceleration = (constant(joint.axis) * part[joint.name] for part in (rates, accelerations))
             if joint.kind == "prismatic":
-                acceleration = acceleration + push + 2 * cross(spin, rate)
+                acceleration = acceleration + joint_acceleration + 2 * cross(omega, rate)
             else:
-                turning = turning + push + cross(spin, rate)
-                spin = spin + rate
-        origin[joint.child] = (spin, turning, acceleration)
-        fields[joint.child] = (acceleration, _field(spin, turning))
+                alpha = alpha + joint_acceleration + cross(omega, rate)
+                omega = omega + rate
+        origin[joint.child] = (omega, alpha, acceleration)
+        fields[joint.child] = (acceleration, _field(omega, alpha))
     return fields
 
 

@@ -77,12 +77,12 @@ def checked_placement(placement: Placement | None, label: str = "world_from_base
     return Frame(orientation, position)
 
 
-def expand_joint_vector(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
+def expand_joint_vector(robot: Robot, vector: Expression, label: str = "q") -> dict[str, Expression]:
     """Return a joint vector's entries by name for all moving joints; a mimic joint's is a multiple of another joint's.
 
     Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """
-    vector = joint_vector(robot, vector, what)
+    vector = joint_vector(robot, vector, label)
     return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
@@ -275,28 +275,28 @@ def link_motions(
     # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
     for joint in robot.joints:
-        velocity, acceleration, spin, turning = origin[joint.parent]
+        velocity, acceleration, omega, alpha = origin[joint.parent]
         arm = frames[joint.child].position - frames[joint.parent].position
-        swing = cross(spin, arm)
-        velocity, acceleration = velocity + swing, acceleration + cross(turning, arm) + cross(spin, swing)
+        swing = cross(omega, arm)
+        velocity, acceleration = velocity + swing, acceleration + cross(alpha, arm) + cross(omega, swing)
         if joint.moves:
             angular, linear = axes[joint.name]
-            rate, push = rates[joint.name], accelerations[joint.name]
+            rate, joint_acceleration = rates[joint.name], accelerations[joint.name]
             if joint.kind == "prismatic":
                 velocity = velocity + linear * rate
-                acceleration = acceleration + linear * push + 2 * cross(spin, linear * rate)
+                acceleration = acceleration + linear * joint_acceleration + 2 * cross(omega, linear * rate)
             else:
-                turning = turning + angular * push + cross(spin, angular * rate)
-                spin = spin + angular * rate
-        origin[joint.child] = (velocity, acceleration, spin, turning)
+                alpha = alpha + angular * joint_acceleration + cross(omega, angular * rate)
+                omega = omega + angular * rate
+        origin[joint.child] = (velocity, acceleration, omega, alpha)
     motions = {}
     for link in robot.links:
-        velocity, acceleration, spin, turning = origin[link.name]
+        velocity, acceleration, omega, alpha = origin[link.name]
         center = frames[link.name].point(link.center_of_mass)
         arm = center - frames[link.name].position
-        swing = cross(spin, arm)
-        acceleration = acceleration + cross(turning, arm) + cross(spin, swing)
-        motions[link.name] = LinkMotion(center, velocity + swing, acceleration, spin, turning)
+        swing = cross(omega, arm)
+        acceleration = acceleration + cross(alpha, arm) + cross(omega, swing)
+        motions[link.name] = LinkMotion(center, velocity + swing, acceleration, omega, alpha)
     return motions
 
 

@@ -35,7 +35,7 @@ class CoverSettings:
     parts: int = 3  # largest number of capsules; distances of more would cost more than their fit saves
     worth_a_part: float = 1.07  # factor by which volume (or overhang, by its fourth root) must fall for a part
     worth_a_box: float = 0.7  # volume of the box over that of the capsules below which the box is taken
-    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
+    split_levels: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
     growth: float = 1e-9  # margin added to covers, larger than rounding errors
     thinnest: float = 1e-6  # smallest thickness of a box, which must not be zero
     directions: int = 48  # initial directions of capsule axes on a hemisphere
@@ -161,14 +161,14 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius.
     """
-    a, b, x, y, fat = parameters.tolist()
+    a, b, x, y, excess_root = parameters.tolist()
     length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
     axis = np.array([a, b, 1.0]) / length
     side = np.array([1.0, 0.0, -a]) / width
     other = np.array([-a * b, width * width, -b]) / (length * width)  # axis x side
     along = (axis[None] @ points.T)[0]
     across = ((side[None] @ points.T)[0] - x) ** 2 + ((other[None] @ points.T)[0] - y) ** 2
-    radius = math.sqrt(across.max()) * (1 + fat * fat)
+    radius = math.sqrt(across.max()) * (1 + excess_root * excess_root)
     caps = np.sqrt(np.maximum(radius * radius - across, 0))
     low, high = float((along + caps).min()), float((along - caps).max())
     if low > high:  # a ball encloses all points
@@ -243,9 +243,9 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
         return covered([_capsule_from_parameters(each, *_approximate_capsule(each, bases)[:2]) for each in points])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
-    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
+    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.split_levels]
     share, k, level = min((share_of_split(k, level), k, level) for k, level in levels)
-    for fraction in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
+    for fraction in (SETTINGS.split_levels[0] / 2, SETTINGS.split_levels[0] / 4):
         step = fraction * spans[k][1]
         nearby = [(share_of_split(k, each), each) for each in (level - step, level + step)]
         share, level = min([(share, level), *nearby])

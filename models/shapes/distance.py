@@ -295,15 +295,14 @@ def _distance_of_columns(
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
     """Return the signed distance of two shapes, one a mesh or cylinder, at `poses` (rotation and position of each)."""
-    one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
-    if isinstance(one, PlaneCore):
-        gap = _least_height(other, one.normal, one.point, rounding)
-    elif isinstance(other, PlaneCore):
-        gap = _least_height(one, other.normal, other.point, rounding)
+    first_core, second_core = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
+    if isinstance(first_core, PlaneCore):
+        gap = _least_height(second_core, first_core.normal, first_core.point, rounding)
+    elif isinstance(second_core, PlaneCore):
+        gap = _least_height(first_core, second_core.normal, second_core.point, rounding)
     else:
-        gap = largest_of(
-            [*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, keep_gradient
-        )
+        gaps = [*_face_gaps(first_core, second_core, rounding), *_face_gaps(second_core, first_core, rounding)]
+        gap = largest_of(gaps, rounding, keep_gradient)
     return gap - (first.swept_radius + second.swept_radius)
 
 

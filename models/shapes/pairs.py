@@ -317,7 +317,7 @@ class _BodyPair:
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
             if largest <= 0:
                 return ALWAYS if overhang == 0 or largest < -overhang else COVERED
-        return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
+        return None if colliding.any() or not self._proves_separation(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
         """Return NEVER if two hulls are disjoint on ever finer joint grids, ALWAYS if they overlap on the first."""
@@ -371,7 +371,7 @@ class _BodyPair:
         back = first[0].transpose(0, 2, 1)
         return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]
 
-    def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
+    def _proves_separation(self, low: Array, high: Array, margin: float) -> bool:
         """Return whether bisection of the joint space proves that two bodies stay farther apart than `margin`, m."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds

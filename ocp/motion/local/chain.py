@@ -231,8 +231,8 @@ class Chain:
         error, jacobians = np.full(len(joints), np.inf), np.zeros((len(joints), 6, len(numbers)))
         active = np.arange(len(joints))
         for step in range(NEWTON.steps + 1):
-            missed, jacobian = self.linearize(joints[active], goal.take(pose[active]), free)
-            worst, previous = np.abs(missed).max(axis=1), error[active]
+            pose_errors, jacobian = self.linearize(joints[active], goal.take(pose[active]), free)
+            worst, previous = np.abs(pose_errors).max(axis=1), error[active]
             error[active], jacobians[active] = worst, jacobian
             # a solution at the limit of rounding no longer improves
             on = (worst > NEWTON.precision) & (worst < (NEWTON.rough if step == 0 else np.inf))
@@ -240,7 +240,7 @@ class Chain:
             on &= (worst < previous / NEWTON.progress) | (step < NEWTON.trial_steps)
             if step == NEWTON.steps or not on.any():
                 break
-            active, change = active[on], _damped_steps(jacobian[on], missed[on])
+            active, change = active[on], _damped_steps(jacobian[on], pose_errors[on])
             joints[active[:, None], numbers] += np.clip(change, -NEWTON.largest_step, NEWTON.largest_step)
         good = error <= NEWTON.exact
         return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
@@ -269,8 +269,8 @@ class Chain:
         same = distance < NEWTON.same
         if (close := np.flatnonzero(~same & (distance < NEWTON.near))).size:
             middle = joints[first[close]] + difference[close] / 2
-            missed, _ = self.linearize(middle, goal.take(pose[first[close]]), numbers)
-            same[close] = np.abs(missed).max(axis=1) <= NEWTON.exact
+            pose_errors, _ = self.linearize(middle, goal.take(pose[first[close]]), numbers)
+            same[close] = np.abs(pose_errors).max(axis=1) <= NEWTON.exact
         kept = np.ones(len(pose), dtype=bool)
         kept[second[same]] = False
         return Solutions(pose[kept], joints[kept], singular[kept])
@@ -288,11 +288,11 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
     return first, second
 
 
-def _damped_steps(jacobian: Array, missed: Array) -> Array:
+def _damped_steps(jacobian: Array, pose_errors: Array) -> Array:
     """Return the joint steps (K, m) of Newton's method for pose errors (K, 6), damped at singularities."""
     transposed = jacobian.transpose(0, 2, 1)
     normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
-    return np.asarray(np.linalg.solve(normal, transposed @ missed[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(normal, transposed @ pose_errors[:, :, None])[:, :, 0])
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:

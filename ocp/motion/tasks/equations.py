@@ -88,7 +88,7 @@ class TaskEquations:
 
             def expression_of(name: str, *shapes: tuple[int, int], rate: bool = False, task: TipTask = task) -> Any:
                 track, words = getattr(task, name), f"{name} rate" if rate else name
-                return track_expression(track.rate if rate else track, time, shapes, what=words, begin=task.begin)
+                return track_expression(track.rate if rate else track, time, shapes, label=words, begin=task.begin)
 
             if task.velocity is not None:
                 parts.append(pace * expression_of("velocity", (task.size, 1)))
