@@ -38,7 +38,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Largest accepted sizes of input, several times those of the largest known files."""
+    """Largest accepted sizes of files and other input, several times the sizes of the largest known files."""
 
     count: int = 1_000_000  # any number that a user chooses, such as a number of nodes
     array_entries: int = 2**22  # entries of one array

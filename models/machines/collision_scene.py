@@ -44,7 +44,7 @@ class PlacedShape(NamedTuple):
 
 
 class Levers(NamedTuple):
-    """Upper bounds on the relative velocity of the two bodies of each of n pairs, per unit rate of each coordinate.
+    """Upper bounds of the relative velocity of the bodies of n pairs of bodies, per unit rate of each coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.

@@ -166,7 +166,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links that fixed joints connect merged, whose dynamics are the same and faster to evaluate."""
+        """The robot after merging links that fixed joints connect: the same dynamics, evaluated faster."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:

@@ -78,7 +78,7 @@ def checked_placement(placement: Placement | None, label: str = "world_from_base
 
 
 def expand_joint_vector(robot: Robot, vector: Expression, label: str = "q") -> dict[str, Expression]:
-    """Return a joint vector's entries by name for all moving joints; a mimic joint's is a multiple of another joint's.
+    """Return a joint vector's entries for all moving joints by name; entries of mimic joints include their multipliers.
 
     Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """

@@ -175,7 +175,7 @@ def resolve_mimics(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return all joints of a robot, with those named in `positions`, and those that mimic them, locked.
+    """Return all joints of a robot after locking the joints named in `positions` and the joints that mimic them.
 
     Positions are in rad or m, by joint name. Other joints that cannot move are locked too: those that mimic a fixed
     joint (which counts as being at 0), or any joint with multiplier 0. A mimic joint that is locked by its own name is
@@ -280,7 +280,7 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return a robot's links and joints without its floating joint, which `joints` contain as the fixed joint `place`.
+    """Return a robot's links and joints after replacing or omitting a floating joint, given as the fixed joint `place`.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.

@@ -102,7 +102,7 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the coefficients (1, 3) of 1, cos(q), sin(q) in fixed . (vector rotated about the axis by sign q)."""
+        """Return coefficients (1, 3) of 1, cos q, sin q in `fixed` . (`vector` rotated about the axis by `sign` q)."""
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)

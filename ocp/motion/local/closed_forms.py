@@ -219,7 +219,7 @@ class _SymbolicLoop(NamedTuple):
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers of a chain, one for each choice of redundant, `lockable` joints that has one."""
+    """Return the closed-form solvers of a chain, one for each suitable choice of redundant joints from `lockable`."""
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
     n, forms = len(chain.order), list[ClosedForm]()

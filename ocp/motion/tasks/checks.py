@@ -284,7 +284,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than rate limits (n,) permit the tip of a fixed arm to move anywhere.
+    """Raise ProblemError if a task is faster than a fixed arm's tip can move anywhere within rate limits (n,).
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
     """

@@ -116,7 +116,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return times (k,) and additional ones, so that target poses are nearly linear in time between neighbours."""
+    """Return times (k,) with times added so that target poses are nearly linear in time between neighbours."""
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
     poses, _ = _target_rows(equations)
