@@ -56,7 +56,7 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return numbers, an array or a nested list as a float array; raise an exception of NOT_NUMBERS for other values.
+    """Return numbers, an array or a nested list as a float array; raise an error from NOT_NUMBERS for other values.
 
     Values that NumPy would convert are refused too: text, True, None, symbols (read as nan) and complex numbers.
     """

@@ -241,7 +241,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion at one of the times at which joints must rest; skip None."""
+    """Raise ProblemError if a task prescribes motion at one of the times (s, or None) at which the joints must rest."""
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = (

@@ -133,7 +133,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of the pose values among the targets of tasks, and the rows of the velocity of each pose."""
+    """Return the indices of the pose values in the column of targets, and the rows of the velocity of each pose."""
     poses, rates, at = list[int](), list[slice](), 0
     for part in equations.bound:
         for pose, rate in part.target_rows.values():
