@@ -58,7 +58,7 @@ class Levers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CollisionScene:
-    """The bodies of a machine, the obstacles, and the pairs of these that are checked for collision.
+    """The bodies of a machine, the obstacles, and the pairs of bodies and obstacles that are checked for collision.
 
     Attributes:
         machine: Any machine; the <collision> shapes of its robot are its bodies, see `models.shapes.bodies`.
@@ -148,7 +148,7 @@ class CollisionScene:
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the pairs that the user excludes from checks: those of two links, and those with an obstacle."""
+        """Return the pairs that the user excludes from checks: of two links, and of a link and an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}

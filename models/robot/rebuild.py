@@ -218,7 +218,7 @@ def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Return the robot with links on fixed joints merged into the links that carry them; its dynamics stay the same.
+    """Return the robot with links on fixed joints merged into the links that carry them, which keeps its dynamics.
 
     The tip frame, the names and order of the moving joints and the frames of their links are unchanged.
 

@@ -120,7 +120,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
 
 def omission_warning(omitted: Sequence[str], origin: str) -> None:
-    """Warn about the parts of a robot description that are left out, if any, and name the description."""
+    """Warn about the parts of a robot description that are left out, if there are any, and name the description."""
     if omitted := list(dict.fromkeys(omitted)):
         more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
         message = f"{origin}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"

@@ -300,7 +300,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points; a face and an edge lie along those of the convex hull."""
+    """Return a box of nearly least volume around points; a face and an edge lie along a face and edge of the hull."""
     frames = [_principal_axes(points)]
     try:
         hull = convex_hull(extreme_points)

@@ -430,7 +430,7 @@ def _grid(values: Array, dimension: int) -> Array:
 
 
 def _poses_below(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
-    """Return the poses of the rigid part below a joint from those of the part above it, at joint vectors q."""
+    """Return the poses of the rigid part below a joint, given the poses of the part above it, at joint vectors q."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset
     shift = shift + turn @ step.translation

@@ -297,7 +297,7 @@ def _companions(matrices: Array) -> tuple[Array, Array, Array]:
 
 
 def _inverses(matrices: Array) -> Array:
-    """Return the inverses of matrices; those of exactly singular matrices are infinite."""
+    """Return the inverses of matrices; the inverse of an exactly singular matrix is infinite."""
     try:
         return np.asarray(np.linalg.inv(matrices))
     except np.linalg.LinAlgError:
