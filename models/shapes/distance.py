@@ -160,7 +160,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from n pairs of shapes to their distances and, as wrenches, the gradients of these.
+    """Return the CasADi Function from n pairs of shapes to their distances and the distances' gradients, as wrenches.
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
@@ -294,16 +294,15 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one a mesh or cylinder; `poses` are their rotations and positions."""
-    one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
-    if isinstance(one, PlaneCore):
-        gap = _least_height(other, one.normal, one.point, rounding)
-    elif isinstance(other, PlaneCore):
-        gap = _least_height(one, other.normal, other.point, rounding)
+    """Return the signed distance of two shapes, one a mesh or cylinder, at `poses` (rotation and position of each)."""
+    first_core, second_core = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
+    if isinstance(first_core, PlaneCore):
+        gap = _least_height(second_core, first_core.normal, first_core.point, rounding)
+    elif isinstance(second_core, PlaneCore):
+        gap = _least_height(first_core, second_core.normal, second_core.point, rounding)
     else:
-        gap = largest_of(
-            [*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, keep_gradient
-        )
+        gaps = [*_face_gaps(first_core, second_core, rounding), *_face_gaps(second_core, first_core, rounding)]
+        gap = largest_of(gaps, rounding, keep_gradient)
     return gap - (first.swept_radius + second.swept_radius)
 
 
@@ -316,7 +315,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the point, segment, box or plane of distance formulas from the column of numbers of a shape."""
+    """Convert the column of numbers of a shape to the point, segment, box or plane that distance formulas use."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -389,7 +388,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return a segment, box or hull of distance formulas in the coordinates of a frame with given centre and axes."""
+    """Transform a segment, box or hull of distance formulas to coordinates of a frame with given centre and axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)
