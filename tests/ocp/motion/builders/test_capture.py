@@ -440,6 +440,7 @@ def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
 def test_guesses_of_both_phases_conserve_the_momentum(request_of: Callable[[], dict[str, Any]]) -> None:
     """The base of a guess moves as its joints make it move, up to the error of the steps in time."""
     request = request_of()
+    tolerance = {"approach": 0.01, "detumble": 0.002}  # of steps of first and of second order
     problem = called(capture_problem, **request)
     carried = pair_momentum(
         request["chaser"], request["target"], base=request["chaser"].base_home(),
@@ -459,4 +460,4 @@ def test_guesses_of_both_phases_conserve_the_momentum(request_of: Callable[[], d
         moves = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)]).map(len(t))
         needed = np.array(moves(base.T, joints.T, rates.T)).T
         gained = cumulative_trapezoid(needed, t, axis=0)
-        np.testing.assert_allclose(base[1:] - base[0], gained, atol=0.02 * np.abs(gained).max(), err_msg=name)
+        np.testing.assert_allclose(base[1:] - base[0], gained, atol=tolerance[name] * np.abs(gained).max())
