@@ -13,16 +13,16 @@ from tests.models.paths.task_paths import seeds
 def random_profile(seed: int) -> SpeedProfile:
     """Return a profile of two to six segments in which the speed stays positive."""
     rng = np.random.default_rng(seed)
-    motion = (rng.uniform(2, 4), rng.normal())
-    rows, jerks = [(0.0, 0.0, *motion)], []
+    v, a = rng.uniform(2, 4), rng.normal()
+    rows, jerks = [(0.0, 0.0, v, a)], []
     for _ in range(int(rng.integers(2, 7))):
         time, jerk = rng.uniform(0.05, 0.3), rng.normal()
-        covered, *motion = integrate_jerk(*motion, jerk, time)
-        rows.append((rows[-1][0] + time, rows[-1][1] + covered, *motion))
+        covered, v, a = integrate_jerk(v, a, jerk, time)
+        rows.append((rows[-1][0] + time, rows[-1][1] + covered, v, a))
         jerks.append(jerk)
-    table = np.array(rows).T
-    assume(table[2].min() > 0.5)
-    return SpeedProfile(*table, np.array(jerks))
+    t, distance, speed, acceleration = np.array(rows).T
+    assume(speed.min() > 0.5)
+    return SpeedProfile(t, distance, speed, acceleration, np.array(jerks))
 
 
 @settings(max_examples=50)
@@ -68,9 +68,14 @@ def test_a_profile_in_two_parts_is_the_whole(seed: int) -> None:
     whole = random_profile(seed)
     cut = len(whole.jerk) // 2
     parts = [
-        SpeedProfile(whole.t[rows] - whole.t[rows][0], *(each[rows] for each in values), whole.jerk[jerks])
+        SpeedProfile(
+            whole.t[rows] - whole.t[rows][0],
+            whole.distance[rows],
+            whole.speed[rows],
+            whole.acceleration[rows],
+            whole.jerk[jerks],
+        )
         for rows, jerks in ((slice(cut + 1), slice(cut)), (slice(cut, None), slice(cut, None)))
-        for values in [(whole.distance, whole.speed, whole.acceleration)]
     ]
     joined = join_profiles(parts)
     for name in ("t", "distance", "speed", "acceleration", "jerk"):
