@@ -65,6 +65,13 @@ def test_without_obstacles_the_time_is_that_of_the_slowest_joint(jerk: float) ->
         np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-9)
 
 
+def test_the_zeros_of_the_joints_do_not_matter() -> None:
+    limits = limits_of(acceleration=[4.0, 2.0], jerk=400.0)
+    path, away = np.array([[-0.9, 0.4], [0.3, 0.1]]), np.array([1.2, 0.3])
+    here, there = (optimal_motion_near(limits, path + offset, TIME) for offset in (0.0, away))
+    np.testing.assert_allclose(there.durations, here.durations, rtol=1e-6, atol=1e-9)
+
+
 def ruckig_duration(path: Array, ends: tuple[Array, Array], bounds: Any) -> float:
     request = InputParameter(2)
     request.current_position, request.target_position = path.tolist()
