@@ -25,7 +25,7 @@ from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, pair_wrenches, soft_minima, soft_minimum
 from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, RIGID, SRDF, Pairs, Reason, checked_pairs
-from models.shapes.shapes import KINDS, Box, MovingObstacle, Shape, checked_shape
+from models.shapes.shapes import SHAPE_KINDS, Box, MovingObstacle, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
 WORLD = -1
@@ -109,7 +109,7 @@ class CollisionScene:
         return f"<CollisionScene of {self.machine!r}: {kinds}, {len(self.pairs)} pairs, clearance {self.clearance:g} m>"
 
     def __post_init__(self) -> None:
-        single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
+        single = isinstance(self.obstacles, (*SHAPE_KINDS, MovingObstacle))
         obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
         for number, obstacle in enumerate(obstacles):
             name = f"obstacles[{number}]"

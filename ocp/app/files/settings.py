@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,10 @@ from warnings import warn
 import casadi as ca
 import numpy as np
 
-from models import Box, Capsule, Cylinder, HalfSpace, Mesh, ModelError, ModelWarning, MovingObstacle, Robot, Sphere
+from models import Mesh, ModelError, ModelWarning, MovingObstacle, Robot
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
-from models.shapes.shapes import Shape
+from models.shapes.shapes import SHAPE_KINDS, Shape
 from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines, read_tree
 from ocp.errors import ProblemError, require
@@ -374,26 +375,25 @@ def rotation_of(entries: TomlTable, _: str = "", entry: str = "rpy") -> Array:
 
 
 POSITION, SIZE = ((TomlTable.vector, 3, f"three {things}", REQUIRED) for things in ("numbers, m", "lengths, m"))
-LENGTH, TURN = (TomlTable.positive, "m", REQUIRED), (rotation_of, "rpy")
-NORMAL = (TomlTable.vector, 3, "three numbers: out of what is solid", REQUIRED)
-SHAPES: dict[str, tuple[type, Readers]] = {
-    "box": (Box, {"size": SIZE, "position": POSITION, "rotation": TURN}),
-    "sphere": (Sphere, {"radius": LENGTH, "position": POSITION}),
-    "capsule": (Capsule, {"radius": LENGTH, "start": POSITION, "end": POSITION}),
-    "cylinder": (Cylinder, {"radius": LENGTH, "length": LENGTH, "position": POSITION, "rotation": TURN}),
-    "halfspace": (HalfSpace, {"normal": NORMAL, "point": POSITION}),
-    "mesh": (Mesh, {"position": POSITION[:3], "rotation": TURN, "scale": (TomlTable.positive, "m for each unit")}),
+SHAPE_ENTRIES: Readers = {  # by the name of a field, the same for all shapes that have this field
+    **dict.fromkeys(("position", "start", "end", "point"), POSITION),
+    **dict.fromkeys(("radius", "length"), (TomlTable.positive, "m", REQUIRED)),
+    "size": SIZE,
+    "normal": (TomlTable.vector, 3, "three numbers: out of what is solid", REQUIRED),
+    "rotation": (rotation_of, "rpy"),
+    "scale": (TomlTable.positive, "m for each unit"),
 }
-"""Kinds of shapes, with their entries."""
+SHAPES = {kind.__name__.lower(): kind for kind in SHAPE_KINDS}
 
 
 def read_shape(table: TomlTable, folder: Path = Path(), kinds: Iterable[str] = SHAPES) -> Any:
     """Return the shape that a table describes; names of mesh files are relative to `folder`."""
-    kind, readers = SHAPES[table.choice("shape", kinds, REQUIRED)]
-    arguments = (
-        {"file": folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)} if kind is Mesh else {}
-    )
-    return table.build(kind, readers, **arguments)
+    kind = SHAPES[table.choice("shape", kinds, REQUIRED)]
+    readers = {each.name: SHAPE_ENTRIES[each.name] for each in fields(kind) if each.name in SHAPE_ENTRIES}
+    if kind is not Mesh:
+        return table.build(kind, readers)
+    file = folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
+    return table.build(kind, readers | {"position": POSITION[:3]}, file=file)
 
 
 def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:
