@@ -213,8 +213,7 @@ class Program:
     @cached_property
     def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of each nonzero of the Jacobian of the constraints."""
-        row, column = self.jacobian.sparsity_out(1).get_triplet()
-        return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
+        return places_of(self.jacobian.sparsity_out(1))
 
 
 class NumericDerivatives:

@@ -308,7 +308,7 @@ def solution_of(
     at[-1] = 1.0
     costates = costates_of(program, transcription, outcome, p)
     gradient = _cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
-    x, u = v[transcription.report_states], controls_at(controls, transcription, interval, place)
+    x, u = v[transcription.report_states], controls.within(interval, place)
     return Solution(
         name=form.name,
         solver=outcome.solver,
@@ -386,11 +386,3 @@ def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> P
     index = starts[:, None] + np.arange(width + 1)
     nodes = np.append(place[(interval + (place == 1.0)) == 0], 1.0)
     return PiecewisePolynomial(transcription.mesh, nodes, costates[index])
-
-
-def controls_at(controls: Any, transcription: Transcription, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the controls at the reported points; at a jump, the value of the interval to which the point belongs."""
-    if len(controls.breaks) == len(transcription.mesh):
-        return np.asarray(controls.within(interval, place))
-    mesh = transcription.mesh
-    return np.asarray(controls(mesh[interval] + np.diff(mesh)[interval] * place))

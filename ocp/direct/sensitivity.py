@@ -15,7 +15,7 @@ from ocp.direct.active_set import RESOLVED, Conditions, conditions
 from ocp.direct.assembly import Program, Transcription, assemble
 from ocp.direct.diagnosis import variable_names
 from ocp.direct.discretisation import Collocation, MultipleShooting
-from ocp.direct.nlp import Outcome, controls_at
+from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Pattern, compute_scales, sizes_along
 from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Formulation
@@ -213,13 +213,12 @@ def control_rates(transcription: Transcription, solution: Solution, p: np.ndarra
 
     The controls are linear in the variables, so that differences are exact.
     """
-    interval, place = transcription.report
     v, columns = solution.variables, []
     for direction in dv.T:
         step = max(1.0, float(np.abs(v).max())) / max(float(np.abs(direction).max()), 1e-300)
         curves = [
             transcription.interpolants(v + sign * step * direction, p, solution.horizon)[1] for sign in (1.0, -1.0)
         ]
-        up, down = (controls_at(curve, transcription, interval, place) for curve in curves)
+        up, down = (curve.within(*transcription.report) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
