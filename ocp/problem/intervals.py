@@ -43,9 +43,13 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
         inputs: The range of each input, over the same M intervals.
     """
-    return interpret(
-        function, inputs, lambda value: constant(value, inputs[0].low), lambda code, *operands: RULES[code](*operands)
-    )
+    with np.errstate(all="ignore"):
+        return interpret(
+            function,
+            inputs,
+            lambda value: constant(value, inputs[0].low),
+            lambda code, *operands: RULES[code](*operands),
+        )
 
 
 def interpret(
@@ -102,16 +106,6 @@ def _range_of(corners: list[Array]) -> Interval:
     """Return the interval from the smallest to the largest of given values, widened by possible rounding errors."""
     stacked = np.array(corners)
     return _widen(stacked.min(axis=0), stacked.max(axis=0))
-
-
-def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
-    """Decorate an interval rule so that it emits no floating-point warnings."""
-
-    def without_warnings(*operands: Interval) -> Interval:
-        with np.errstate(all="ignore"):
-            return rule(*operands)
-
-    return without_warnings
 
 
 def _add(x: Interval, y: Interval) -> Interval:
@@ -357,6 +351,6 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "OR": lambda x, y: _not(_and(_not(x), _not(y)))._replace(negates=None),
     "IF_ELSE_ZERO": _if_else_zero,
 }
-RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}
+RULES = {getattr(ca, f"OP_{name}"): rule for name, rule in _BY_NAME.items()}
 """Interval rules of operations, by the instruction code of casadi."""
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

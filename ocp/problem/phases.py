@@ -83,10 +83,11 @@ class Phases(Problem):
     """
 
     def __init__(self, name: str, phases: Mapping[str, Problem]) -> None:
-        if not _by_name("phases", phases):
+        phases = require.mapping("phases", phases)
+        if not phases:
             raise ProblemError(f"problem {name!r}: phases must not be empty", name="phases")
         for phase, problem in phases.items():
-            if not require.text(f"problem {name!r}: name of a phase", phase) or "." in phase:
+            if not phase or "." in phase:
                 words = f"problem {name!r}: a phase needs a name without a dot, not {phase!r}"
                 raise ProblemError(words, name="phases", value=phase)
             if checked_problem(problem).declared.phases:
@@ -128,7 +129,7 @@ class Phases(Problem):
             ProblemError: An unknown phase or state, an expression of the wrong size, a second join, nothing to join.
         """
         first, second = self[before], self[after]
-        values = dict(_by_name("states", {} if states is None else states))
+        values = require.mapping("states", states)
         begins = {name: v for name, v in parts_of_phase(after, self.declared.states).items() if name != DURATION}
         ends = parts_of_phase(before, self.declared.states)
         for name in values:
@@ -318,12 +319,6 @@ def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
     """Return those states, controls or other entries that belong to a phase, by their names within the phase."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
-
-
-def _by_name(what: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ProblemError(f"{what}: a mapping by name is expected, not {value!r}", name=what, value=value)
-    return value
 
 
 def _of_fraction(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:

@@ -25,7 +25,7 @@ from ocp.problem.declarations import (
     Variable,
 )
 from ocp.problem.enclosures import PrescribedMotion
-from ocp.problem.expressions import ExpressionReader, check_guess, number_of_entries, read_scale, signal_function
+from ocp.problem.expressions import ExpressionReader, check_guess, number_of_entries, read_positive, signal_function
 from ocp.problem.hulls import Hull, Separation, index_rows, stack_motion_bounds
 from ocp.problem.record_reader import from_record
 from ocp.problem.record_writer import to_record
@@ -397,7 +397,7 @@ class Problem:
         parameters = self._reader.parameters
         known = [*(state.symbol for state in states.values()), *parameters, self.time]
         frames = self._reader.expression(f"{what}: placements", placements, known)
-        parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
+        parts |= {"covers": covers, "assumed": assumed}
         separation = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         zeros = [ca.DM.zeros(parameter.shape) for parameter in parameters]
         PrescribedMotion(
@@ -446,7 +446,8 @@ class Problem:
         symbol = self._symbol(kind, name, size)
         low, high = self._reader.bounds(what, size, values["lower"], values["upper"])
         check_guess(what, guess, size)
-        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=read_scale(what, scale, size))
+        scales = read_positive(f"{what}: scale", scale, size, scale=True)
+        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=scales)
 
     @property
     def _reader(self) -> ExpressionReader:
