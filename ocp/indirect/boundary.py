@@ -276,6 +276,9 @@ class NewtonSettings:
     descent: float = 1e-4
 
 
+SETTINGS = NewtonSettings()
+
+
 @dataclass(frozen=True)
 class NewtonResult:
     """Last iterate of Newton's method, its residual, the number of steps, and the status with a message."""
@@ -293,13 +296,7 @@ class NewtonResult:
 
 
 def newton(
-    system: tuple[Any, ...],
-    start: np.ndarray,
-    data: np.ndarray,
-    *,
-    scale: float,
-    tolerance: float,
-    settings: NewtonSettings = NewtonSettings(),
+    system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, *, scale: float, tolerance: float
 ) -> NewtonResult:
     """Solve a sparse nonlinear system by damped Newton steps, each halved until the residual decreases."""
     residual, jacobian = system
@@ -313,7 +310,7 @@ def newton(
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     polished, stopped = False, None
     with stop_requests_polled():
-        for steps in range(settings.steps + 1):
+        for steps in range(SETTINGS.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
                 return NewtonResult(z, size, steps, SolverStatus.NOT_FINITE, "the integration fails at the seed")
@@ -321,7 +318,7 @@ def newton(
                 return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step costs little and gains digits
             stopped = reason_to_stop()
-            if stopped or steps == settings.steps:
+            if stopped or steps == SETTINGS.steps:
                 break
             try:
                 with casadi_silenced():
@@ -340,10 +337,10 @@ def newton(
                 status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED
                 return NewtonResult(z, size, steps, status, word)
             length = 1.0
-            for _ in range(settings.halvings):
+            for _ in range(SETTINGS.halvings):
                 trial = z + length * step
                 trial_value = residual_at(trial)
-                if np.linalg.norm(trial_value) < (1.0 - settings.descent * length) * np.linalg.norm(value) or polished:
+                if np.linalg.norm(trial_value) < (1.0 - SETTINGS.descent * length) * np.linalg.norm(value) or polished:
                     break
                 length *= 0.5
             else:
@@ -354,4 +351,4 @@ def newton(
             z, value = trial, trial_value
     if stopped is not None:
         return NewtonResult(z, size, steps, stopped, str(stopped))
-    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")
+    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {SETTINGS.steps} Newton steps")
