@@ -490,8 +490,7 @@ def compile_functions(contents: Sequence[str], names: Sequence[str], build: Call
 
     Args:
         contents: As of :func:`build_library`.
-        names: Names of the functions.
-        build: Function that returns them; not called if the library is in the cache.
+        names, build: Names of the functions, and what returns them; not called if the library is in the cache.
     """
     try:
         path = build_library(contents, lambda: generate_c(build(), "unit", header=False)[0])
