@@ -273,10 +273,10 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
     """Write the C files of a problem for a controller to a folder; return the folder and raise as :func:`write_c`."""
     texts = {"curves.h": CURVES, "problem.h": problem_header(form, transcription), "main.c": MAIN, "Makefile": MAKEFILE}
-    return write_c(form, controller_functions(form, transcription, guess), "plan", folder, texts)
+    return write_c(form, controller_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
 
 
-def write_c(form: Formulation, functions: list[Any], name: str, folder: Path, texts: dict[str, str]) -> Path:
+def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path, texts: dict[str, str]) -> Path:
     """Write functions of a problem as NAME.c and NAME.h, and further files, to a folder that is created and returned.
 
     Each file is written completely or not at all; files of the same names are replaced.

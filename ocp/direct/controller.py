@@ -240,7 +240,7 @@ class Controller:
             lines += [f"static double {name}[] = {{", *(f"  {number}," for number in numbers), "};"]
         lines += [c_strings("parameters", form.parameter_labels), c_strings("controls", form.control_labels), ""]
         texts = {"start.h": "\n".join(lines), "main.c": MAIN, "Makefile": MAKEFILE}
-        return write_c(form, [self._build(self._functions)[1]], "controller", place, texts)
+        return write_c(form, [self._build(self._functions)[1]], "controller", folder=place, texts=texts)
 
     def _build(self, functions: ProgramFunctions) -> tuple[Any, Any]:
         """Return the solver, and the casadi Function of a step, which solves again from another start if it fails."""

@@ -52,10 +52,11 @@ class Hull:
     link: str = ""
 
     def __post_init__(self) -> None:
-        core, normal = require.array("hull: core", self.core, ("m", 3)), require.array("hull: normal", self.normal)
+        core = require.array("hull: core", self.core, ("m", 3))
+        normal = require.array("hull: normal", self.normal, (3,)) if np.size(self.normal) else np.zeros(0)
         radius = require.nonnegative("hull: radius", self.radius, unit="m")
-        if normal.size and (normal.shape != (3,) or not abs(np.linalg.norm(normal) - 1) < 1e-9):
-            words = f"hull: normal {normal.tolist()} is not a unit vector of three entries"
+        if normal.size and not abs(np.linalg.norm(normal) - 1) < 1e-9:
+            words = f"hull: normal {normal.tolist()} is not a unit vector"
             raise ProblemError(words, name="normal", value=normal.tolist())
         set_fields(self, frame=int(self.frame), core=core, radius=radius, normal=normal)
 
