@@ -150,7 +150,7 @@ def largest_changes(
                     moved = hull.core @ rotation.transpose(0, 2, 1) + speed[:, None]
                     fastest = np.maximum(fastest, np.linalg.norm(moved, axis=2).max(axis=1) + turn * hull.radius)
                 changes[chosen] += reach[at[chosen], axis] * fastest
-    return np.minimum(changes, (arms * spans).sum(axis=1))
+    return np.asarray(np.minimum(changes, (arms * spans).sum(axis=1)))
 
 
 def _has_exact_depth(first: Hull, second: Hull) -> bool:
