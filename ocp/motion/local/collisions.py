@@ -116,8 +116,9 @@ def largest_changes(
         sum of reach_a |dp/dt_a| + lever . rest + (turn . |d|) (lever . |d|),
 
     with the levers and turns of the scene; the last term is half the bound of p'' in :mod:`ocp.problem.hulls`. The
-    first term is largest at a point of the core. Unlike lever . |d|, it is 0 for a body that the self-motion T leaves
-    in place. The levers alone bound the change where the penetration depth is an estimate, which may be too large.
+    points are those of the cores, whose distances are greater by the radii of the bodies. Unlike lever . |d|, the first
+    term is 0 for a body that the self-motion T leaves in place. The levers alone bound the change where the penetration
+    depth is an estimate, which may be too large.
 
     Args:
         joints: Middle configurations of a machine on a fixed base. Shape (M, n).
@@ -136,19 +137,14 @@ def largest_changes(
         for number in np.unique(pair).tolist():
             chosen = np.flatnonzero(pair == number)
             *bodies, observer = scene.pairs[number].tolist()
-            covers = np.array([bodies, *scene.covers.get(number, ())])
-            if not all(_has_exact_depth(hulls[first], hulls[second]) for first, second in covers.tolist()):
+            if number in scene.covers or not _has_exact_depth(*(hulls[body] for body in bodies)):
                 changes[chosen] = np.inf
                 continue
-            for frame, parts in zip((hulls[body].frame for body in bodies), covers.T.tolist(), strict=True):
-                if frame in (observer, WORLD):
-                    continue
-                poses = [_relative_pose(each, index[chosen], frame, observer) for each in ends]
+            for hull in (hulls[body] for body in bodies if hulls[body].frame not in (observer, WORLD)):
+                poses = [_relative_pose(each, index[chosen], hull.frame, observer) for each in ends]
                 rotation, speed = ((first - last) / (2 * step) for first, last in zip(*poses, strict=True))
-                turn, fastest = np.linalg.norm(rotation, axis=(1, 2)) / np.sqrt(2), np.zeros(len(chosen))
-                for hull in (hulls[part] for part in set(parts)):
-                    moved = hull.core @ rotation.transpose(0, 2, 1) + speed[:, None]
-                    fastest = np.maximum(fastest, np.linalg.norm(moved, axis=2).max(axis=1) + turn * hull.radius)
+                moved = hull.core @ rotation.transpose(0, 2, 1) + speed[:, None]
+                fastest = np.linalg.norm(moved, axis=2).max(axis=1)
                 changes[chosen] += reach[at[chosen], axis] * fastest
     return np.asarray(np.minimum(changes, (arms * spans).sum(axis=1)))
 

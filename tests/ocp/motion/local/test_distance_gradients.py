@@ -154,9 +154,13 @@ def test_a_self_motion_that_leaves_the_hand_in_place_changes_its_distances_to_se
     columns = ca.vertcat(pose.position, ca.vec(pose.rotation))
     tangent = np.linalg.svd(np.array(ca.Function("rates", [symbols], [ca.jacobian(columns, symbols)])(q[0])))[2][-1]
     pair = np.array([around.labels.index(("panda_hand", "obstacle 0"))])
-    box = tangent[None, :, None], np.full((1, 1), 1e-3), np.zeros((1, 7))
-    bound = largest_changes(around, q, np.zeros(1, dtype=int), pair, box=box)[0]
-    assert bound < 0.01 * 1e-3 * float(around.levers.joints[pair[0]] @ np.abs(tangent))
+    for reach, share in ((1e-3, 0.01), (0.1, 1.0)):
+        box = tangent[None, :, None], np.full((1, 1), reach), np.zeros((1, 7))
+        bound = largest_changes(around, q, np.zeros(1, dtype=int), pair, box=box)[0]
+        ends = q + np.outer((0.0, -reach, reach), tangent)
+        distances = distances_along(around, np.zeros(0), ends, np.zeros(3))[:, pair[0]]
+        assert 0 < np.abs(distances - distances[0]).max() <= bound
+        assert bound < share * reach * float(around.levers.joints[pair[0]] @ np.abs(tangent))
 
 
 def test_values_that_are_no_numbers_stay_undefined(few: tuple[CollisionScene, list[int], Any]) -> None:
