@@ -306,5 +306,5 @@ class SectionSearch(AtlasSearch):
                 path = restricted._path_through_centers(restricted.full_graph())
                 through_centers += [path] if path is not None else []
         best = sorted(through_centers, key=self.path_cost)[: self.settings.max_classes]
-        found = [self.find_path(np.inf)[1], *(self._shorten(path, self.layers) for path in best)]
-        return sorted((path for path in found if path is not None), key=self.path_cost), 0.0
+        shortened = [self.find_path(np.inf)[1], *(self._shorten(path, self.layers) for path in best)]
+        return sorted((path for path in shortened if path is not None), key=self.path_cost), 0.0
