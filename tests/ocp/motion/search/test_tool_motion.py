@@ -10,6 +10,7 @@ import pytest
 
 from models import FixedBase, Joint, Link, Robot
 from models.checks import Array
+from models.robot.parts import Kind
 from models.robot.rebuild import lock_joints, mount_on_rail
 from ocp import Limits, ProblemError, Waypoints, plan
 from ocp.motion.result.path_plan import PathPlan
@@ -46,7 +47,7 @@ def joint_path(machine: FixedBase, rng: np.random.Generator, count: int = 9) -> 
     n = machine.joint_size
     low, high = np.maximum(machine.robot.lower, -2.0), np.minimum(machine.robot.upper, 2.0)
     start = low + rng.uniform(0.3, 0.7, n) * (high - low)
-    return np.clip(start + np.cumsum(rng.normal(scale=0.1, size=(count, n)), axis=0), low, high)
+    return np.asarray(np.clip(start + np.cumsum(rng.normal(scale=0.1, size=(count, n)), axis=0), low, high))
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -75,7 +76,7 @@ def test_a_locked_joint_never_lowers_the_bound(kind: type[Homogeneous]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["prismatic", "revolute"])
-def test_of_a_single_joint_the_bound_is_exact(kind: str) -> None:
+def test_of_a_single_joint_the_bound_is_exact(kind: Kind) -> None:
     joint = Joint("joint", kind, "base", "tool", (0.1, 0.0, 0.3), axis=(0.0, 0.6, 0.8), lower=-3.0, upper=3.0)
     machine = FixedBase(Robot((Link("base"), Link("tool")), (joint,), "tool", (0.3, -0.2, 0.1)))
     path = joint_path(machine, np.random.default_rng(5))
