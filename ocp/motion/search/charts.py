@@ -49,7 +49,7 @@ class ChartSettings:
 
     corrections: int = 12
     spacing: float = 0.9
-    flatness: tuple[float, float, float] = (0.1, 0.1, 0.15)
+    flatness: tuple[float, float, float, float] = (0.1, 0.1, 0.15, 0.15)
     halvings: int = 7
     listed: int = 64
     starts: int = 16

@@ -27,7 +27,7 @@ from models import CollisionScene
 from models.checks import Array
 from ocp.console import TimeLimitReached
 from ocp.errors import BoundWarning
-from ocp.motion.local.collisions import distances_along
+from ocp.motion.local.collisions import distances_along, largest_changes
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, concatenate, point_chart
 from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
@@ -146,14 +146,12 @@ class AtlasSearch:
             layer, joints = (np.array(part) for part in zip(*configurations, strict=True))
             charts = sets.cover(layer, joints, self.settings.radii[sets.size], self.settings.charts)
             atlas += [charts.select(charts.layer == self.samples[k].row) for k in rows]
-        if self.start is not None:
-            atlas[0] = point_chart(self.start)
+        atlas = atlas if self.start is None else [point_chart(self.start), *atlas[1:]]
         for k, charts in enumerate(atlas):
             if not len(charts):
                 seeds(k)  # raises an error that names the pose
                 words = f"at {self.times[k]:.4g} s no configuration that does the tasks is within limits"
-                time = float(self.times[k])
-                raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=time)
+                raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=float(self.times[k]))
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
@@ -161,12 +159,17 @@ class AtlasSearch:
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
-        scene = self.scene
-        if scene is None or not len(charts):
-            return np.ones(len(charts), dtype=bool)
-        times, base = np.full(len(charts), self.times[k]), np.zeros(0)
-        distances = distances_along(scene, base, charts.centers, times, cutoff=scene.clearance)
-        return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
+        """Return which charts of a time sample may contain a configuration without collision. Shape (N,)."""
+        scene, free = self.scene, np.ones(len(charts), dtype=bool)
+        if scene is None:
+            return free
+        times = np.full(len(charts), self.times[k])
+        distances = distances_along(scene, np.zeros(0), charts.centers, times, cutoff=scene.clearance)
+        at, pair = np.nonzero(distances < scene.clearance)
+        box = charts.tangents, np.maximum(np.abs(charts.low), np.abs(charts.high)), charts.max_deviation
+        largest = distances[at, pair] + largest_changes(scene, charts.centers, at, pair, box=box)
+        free[at[largest < scene.clearance]] = False
+        return free
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
         """Return the graph whose nodes are manifold charts and whose edges are steps of limited cost between charts.

@@ -194,7 +194,7 @@ class ShorteningSettings:
         least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
     """
 
-    neighbours: tuple[int, int, int] = (0, 5, 2)
+    neighbours: tuple[int, int, int, int] = (0, 5, 2, 1)
     max_moves: int = 10
     least_gain: float = 1e-4
 
@@ -206,13 +206,13 @@ def shorten_path(
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
-        problem: Manifolds, all of dimension one or all of two (others leave the path unchanged), steps and limits.
+        problem: Manifolds, all of one dimension from one to three (others leave the path unchanged), steps and limits.
         widths: Initial and final spacing of the configurations, in the metric.
         settings: Settings of the dynamic programming.
     """
     joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
     steps, dimension, tangents = problem.steps, problem.dimension, None
-    if dimension not in (1, 2):
+    if dimension not in (1, 2, 3):
         return path
     count_per_side = settings.neighbours[dimension]
     shifts = np.array(list(product(np.arange(-count_per_side, count_per_side + 1.0), repeat=dimension)))
