@@ -48,7 +48,7 @@ class RefinementSettings:
         max_parts: Maximum number of parts into which an interval is split at once.
         least_width: Smallest width of an interval, relative to the horizon: less is rounding.
         rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
-        nearer: Largest ratio of a row to its best earlier value that counts as progress.
+        nearer: Largest ratio of a row's unresolved part to its best earlier value that counts as progress.
         same_switch: Distance of a switch from a node, relative to the horizon, below which the node is at the switch.
 
     Raises:
@@ -164,8 +164,11 @@ def _refine_mesh(
     intervals: list[int] = []
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     best: dict[str, float] = {}
-    idle, late = 0, False
-    moving, placed = isinstance(method, Collocation) and method.control == "points", np.zeros(0)
+    vain: dict[str, int] = {}
+    idle, late, placed = 0, False, np.zeros(0)
+    moving = isinstance(method, Collocation) and method.control == "points"
+    driven = {f"bounds of {name}" for name in solution.controls}
+    driven |= {owner for owner, controlled in zip(form.path.owners, form.path.uses_control, strict=True) if controlled}
 
     def assess() -> tuple[list[_Row], list[_Row]]:
         """Record the errors of the last plan; return all rows, and those beyond their limits."""
@@ -177,21 +180,26 @@ def _refine_mesh(
 
     while True:
         rows, beyond = assess()
-        nearer = [row for row in beyond if row.value < settings.nearer * best.get(row.name, np.inf)]
-        best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
-        idle = 0 if nearer else idle + 1
+        unresolved = {row.name: row.unresolved(np.diff(method.fractions)) for row in beyond}
+        nearer = [name for name, part in unresolved.items() if part < settings.nearer * best.get(name, np.inf)]
+        best |= {name: min(part, best.get(name, np.inf)) for name, part in unresolved.items()}
+        vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
+        idle = min(vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
-        if at_switches is not None and idle > settings.patience:  # nodes that keep moving stay where they are
-            at_switches, moving, idle = None, False, 0
-        if at_switches is None:
-            parts = _parts_per_interval(beyond, rows, method.fractions, settings)
-            finer = split(method.fractions, *parts, settings.max_intervals)
-        else:
+        following = method
+        if moving and any(vain[name] >= settings.patience for name in driven & vain.keys()):
+            # controls that oscillate on every mesh have, held over each interval, no values beyond those of the solver
+            following, moving, vain, best = replace(method, control="held"), False, {}, {}
+        elif at_switches is not None:
             finer, placed = at_switches
-        spent = (at_switches is None and idle >= settings.patience) or len(intervals) == settings.rounds
-        if not beyond or spent or np.array_equal(finer, method.fractions):
+            following = method.with_mesh(finer)
+        elif idle < settings.patience:
+            parts = _parts_per_interval(beyond, rows, method.fractions, settings)
+            following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
+        unchanged = following.control == method.control and np.array_equal(following.fractions, method.fractions)
+        if not beyond or unchanged or len(intervals) == settings.rounds:
             break
-        method = method.with_mesh(finer)
+        method = following
         result = _next(problem, method, {**arguments, "guess": solution}, settings)
         if result is None:
             late = True
@@ -319,6 +327,17 @@ class _Row(NamedTuple):
     order: int = 1
     grows: bool = False
 
+    def unresolved(self, widths: np.ndarray) -> float:
+        """Return the error beyond its limit, integrated over the horizon; ``widths`` (N,) are those of the intervals.
+
+        Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
+        only once the intervals are narrow enough.
+        """
+        if self.errors is None:
+            return self.value
+        beyond = self.errors > 1.0
+        return float(widths[beyond] @ self.errors[beyond])
+
 
 class _Parts(NamedTuple):
     """Contributions of the mesh intervals to an error that the audit reports; the error is their sum or maximum.
@@ -423,7 +442,7 @@ def _mesh_at_switches(
     finer = mesh
     if any(row.errors is not None and (row.errors[~smeared] > 1.0).any() for row in beyond):
         parts, error = _parts_per_interval(beyond, rows, mesh, settings)
-        parts[smeared] = 1
+        parts[smeared & ~np.isin(mesh[:-1], placed) & ~np.isin(mesh[1:], placed)] = 1
         finer = split(mesh, parts, error, settings.max_intervals)
     own = np.clip(np.searchsorted(mesh, placed), 1, method.intervals - 1)
     replaced = ((mesh[own - 1, None] <= at) & (at <= mesh[own + 1, None])).any(axis=1)
