@@ -38,10 +38,13 @@ Row = dict[str, Any]
 
 
 def refined(problem: Problem, method: Method) -> Solution:
-    """The plan on a mesh that is refined by its audits; by the minimum principle where that is the method."""
+    """The plan on a mesh that is refined by its audits; by the minimum principle where that is the method.
+
+    It may lose as much cost as costs may differ that agree.
+    """
     if isinstance(method, Indirect):
         return solve(problem, method)
-    settings = RefinementSettings(max_intervals=FINER * method.intervals)
+    settings = RefinementSettings(limits={"lost": DEVIATION}, max_intervals=FINER * method.intervals)
     return refine(problem, method, settings=settings)
 
 
