@@ -23,9 +23,8 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.solution_data import Refinement, stack
-from ocp.switching import WARM_START_OPTIONS, locate_switches, nodes_at_switches
-from ocp.tightening import tighten
-from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
+from ocp.switching import locate_switches, nodes_at_switches
+from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 INTEGRATION = "integration error, relative"
@@ -41,8 +40,6 @@ class RefinementSettings:
             :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By default the audit's own.
         max_intervals: Maximum number of intervals.
         solver: As for :func:`ocp.methods.prepare`.
-        tighten: Whether limits that no mesh satisfies between its points are tightened in the end (see
-            :func:`ocp.tightening.tighten`), if the cost increases by less than the plan may lose.
         target: Value of a row, relative to its limit, at which splitting aims: half, as the order of an error is
             uncertain.
         max_parts: Maximum number of parts into which an interval is split at once.
@@ -58,7 +55,6 @@ class RefinementSettings:
     limits: Mapping[str, Any] = field(default_factory=dict)
     max_intervals: int = 400
     solver: str = "ipopt"
-    tighten: bool = True
     target: float = 0.5
     max_parts: int = 4
     least_width: float = ROUNDING_SHARE
@@ -94,8 +90,8 @@ def refine(
     kept. Every round starts from the previous plan.
 
     Collocation with controls at the points gets a node at each switch: where a control jumps from limit to limit,
-    enters or leaves a singular arc, or where a state reaches or leaves its limit. If in the end nothing but limits is
-    exceeded between the points, they are tightened; see `RefinementSettings.tighten`.
+    enters or leaves a singular arc, or where a state reaches or leaves its limit. Where controls exceed their limits
+    between the points on every mesh, as the polynomials of a singular arc do, they are held over each interval.
 
     Args:
         problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
@@ -146,7 +142,7 @@ def refine_from(
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings(tighten=False))
+    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
 
 
 def _refine_mesh(
@@ -186,10 +182,13 @@ def _refine_mesh(
         vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
         idle = min(vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
+        oscillates = moving and any(vain[name] >= settings.patience for name in driven & vain.keys())
+        if oscillates or (moving and idle >= settings.patience):  # nodes at switches do not help
+            moving, at_switches, idle, vain, best = False, None, 0, {}, {}
         following = method
-        if moving and any(vain[name] >= settings.patience for name in driven & vain.keys()):
-            # controls that oscillate on every mesh have, held over each interval, no values beyond those of the solver
-            following, moving, vain, best = replace(method, control="held"), False, {}, {}
+        if oscillates and isinstance(method, Collocation):
+            # held over each interval, controls that oscillate on every mesh have no values but those of the solver
+            following = replace(method, control="held")
         elif at_switches is not None:
             finer, placed = at_switches
             following = method.with_mesh(finer)
@@ -205,9 +204,6 @@ def _refine_mesh(
             late = True
             break
         solution, audit = result
-    if beyond and not late and (tightened := _tightened(problem, method, (solution, audit), arguments, settings)):
-        solution, audit = tightened
-        _, beyond = assess()
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {settings.max_intervals} intervals"
     idles = idle == settings.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
@@ -215,42 +211,6 @@ def _refine_mesh(
     history = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
     return replace(solution, refinement=refinement), audit
-
-
-def _tightened(
-    problem: Problem,
-    method: DirectMethod,
-    plan: tuple[Solution, Audit],
-    arguments: dict[str, Any],
-    settings: RefinementSettings,
-) -> tuple[Solution, Audit] | None:
-    """Return the plan under tightened limits and its audit; None unless it is feasible and loses hardly any cost.
-
-    It is tried where nothing but limits fails, such as bounds of a control near a singular arc.
-    """
-    solution, audit = plan
-    failures = [finding for finding in audit.failures if finding.verdict == "feasible"]
-    limited = {f"bounds of {name}" for name in (*solution.states, *solution.controls)}
-    limited |= set(Formulation.of(problem).path.names)
-    if not (settings.tighten and failures and {finding.name for finding in failures} <= limited):
-        return None
-    excess = min(finding.limit for finding in failures if finding.limit is not None) / 2
-    largest = solution.cost + LIMIT_SHARE * abs(solution.cost)
-    options = {**WARM_START_OPTIONS, **(arguments["options"] or {})}
-    try:
-        result = tighten(
-            problem,
-            method,
-            tolerance=excess,
-            parameters=solution.parameters,
-            options=options,
-            guess=solution,
-            max_cost=largest,
-        )
-        checked = judge(problem, result, **settings.limits)
-    except (SolveError, TimeLimitReached):
-        return None
-    return (result, checked) if checked.feasible and result.cost <= largest else None
 
 
 def _shortfall(

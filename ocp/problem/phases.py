@@ -125,12 +125,14 @@ class Phases(Problem):
             ProblemError: The horizon is no number, a time is outside it, a cost is no scalar of the states, or the
                 problem has signals, watched constraints, separations or phases.
         """
-        problem.check()
-        declared, what = problem.declared, f"problem {checked_problem(problem).name!r}"
+        checked_problem(problem).check()
+        declared, what = problem.declared, f"problem {problem.name!r}"
         if declared.signals or declared.watch or declared.apart or declared.phases:
             raise ProblemError(f"{what}: with costs at times it can have no signals, watches, separations or phases")
-        total = float(constant(declared.horizon.lower)[0]) if declared.horizon and declared.horizon.fixed else np.nan
-        if not all(0.0 <= time <= total for time in costs):
+        horizon = declared.horizon
+        assert horizon is not None
+        total = float(constant(horizon.lower)[0]) if horizon.fixed else np.nan
+        if not _by_name("costs", costs) or not all(0.0 <= time <= total for time in costs):
             raise ProblemError(f"{what}: costs at {sorted(costs)} s do not fit its horizon, {total} s", name="costs")
         times = np.unique([0.0, *costs, total]).tolist()
         legs = {f"p{k}": _leg(problem, begin, end, total) for k, (begin, end) in enumerate(pairwise(times))}
@@ -141,8 +143,8 @@ class Phases(Problem):
 
         def at(phase: Phase, expression: Any, begin: bool = False) -> Any:
             """Return an expression of states and of values at the start, at one end of a phase."""
-            old, new = [problem.time, declared.horizon.symbol], [phase.begin if begin else phase.begin + phase.duration]
-            new.append(total)
+            time = phase.begin if begin else phase.begin + phase.duration
+            old, new = [problem.time, horizon.symbol], [time, total]
             for name, variable in declared.states.items():
                 if name in shared:
                     here = first = whole.declared.states[name].symbol
@@ -387,9 +389,10 @@ def _leg(problem: Problem, begin: float, end: float, total: float) -> Problem:
     """
     leg = copy(problem)
     own = leg.declared
+    assert own.horizon is not None
+    old, new = [problem.time, own.horizon.symbol], [problem.time + begin, problem.symbols(total)]
 
     def moved(expression: Any) -> Any:
-        old, new = [problem.time, problem.declared.horizon.symbol], [problem.time + begin, problem.symbols(total)]
         return ca.substitute([problem.symbols(expression)], old, new)[0]
 
     def guess(value: Any) -> Any:

@@ -295,7 +295,7 @@ def test_a_switch_gets_a_node_so_that_the_plan_passes(scheme: str) -> None:
 def test_an_overshoot_that_nothing_reduces_is_reported_after_few_rounds() -> None:
     """Control polynomials through points on both sides of a switch overshoot by the same share in any interval."""
     problem, *_ = hurried()
-    settings = RefinementSettings(tighten=False, max_intervals=7)
+    settings = RefinementSettings(max_intervals=7)
     with pytest.warns(RefinementWarning, match=r"at .* of its limit; raise max_intervals") as report:
         solution = refine(problem, MultipleShooting(7, control="linear"), tolerance=1.0, settings=settings)
     assert solution.refinement is not None

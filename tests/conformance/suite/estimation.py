@@ -39,7 +39,7 @@ def estimation(
     """
     measured, at, start = data.shape[1], data if guess is None else guess, times[0]
     problem = Problem(name)
-    y = problem.state("y", states, initial=initial, lower=lower, guess=samples([t - start for t in times], at))
+    y = problem.state("y", states, initial=initial, lower=lower, guess=samples([t - start for t in times], at.tolist()))
     problem.horizon(times[-1] - start)
     problem.dynamics(y, declare(problem, y))
     known = 0 if initial is None else 1
