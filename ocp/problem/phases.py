@@ -143,19 +143,12 @@ class Phases(Problem):
 
         def at(phase: Phase, expression: Any, begin: bool = False) -> Any:
             """Return an expression of states and of values at the start, at one end of a phase."""
-            time = phase.begin if begin else phase.begin + phase.duration
-            old, new = [problem.time, horizon.symbol], [time, total]
-            for name, variable in declared.states.items():
-                if name in shared:
-                    here = first = whole.declared.states[name].symbol
-                else:
-                    here, first = phase.at_start(name) if begin else phase.at_end(name), whole["p0"].at_start(name)
-                old, new = [*old, variable.symbol], [*new, here]
-                if name in declared.at_start:
-                    old, new = [*old, declared.at_start[name]], [*new, first]
-            for name, parameter in whole.declared.parameters.items():
-                old, new = [*old, declared.parameters[name].symbol], [*new, parameter.symbol]
-            return ca.substitute([problem.symbols(expression)], old, list(map(problem.symbols, new)))[0]
+            pairs = [(problem.time, phase.begin if begin else phase.begin + phase.duration), (horizon.symbol, total)]
+            pairs += [(declared.parameters[name].symbol, own.symbol) for name, own in whole.declared.parameters.items()]
+            pairs += [(v.symbol, phase.at_start(n) if begin else phase.at_end(n)) for n, v in declared.states.items()]
+            pairs += [(symbol, whole["p0"].at_start(name)) for name, symbol in declared.at_start.items()]
+            old, new = zip(*pairs, strict=True)
+            return ca.substitute([problem.symbols(expression)], list(old), list(map(problem.symbols, new)))[0]
 
         last = whole[next(reversed(legs))]
         for name, end in declared.end.items():
@@ -175,8 +168,10 @@ class Phases(Problem):
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
-        """Return the states and controls of a phase by their names in that phase."""
-        return parts_of_phase(self[phase].name, {**self.declared.states, **self.declared.controls})
+        """Return the states and controls of a phase by their names in it, and the shared free parameters."""
+        pool = {**self.declared.states, **self.declared.controls}
+        shared = {name: own for name, own in pool.items() if name.partition(".")[0] not in self.declared.phases}
+        return shared | parts_of_phase(self[phase].name, pool)
 
     def join(self, before: str, after: str, states: Mapping[str, Any] | None = None) -> None:
         """Declare that one phase continues another: states of the same name are equal at the junction.

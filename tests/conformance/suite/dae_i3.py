@@ -31,7 +31,7 @@ def rates(problem: Problem, y: Any) -> Any:
 def build() -> Phases:
     guess = np.hstack([DATA, np.gradient(DATA, TIMES, axis=0)])
     phases = estimation("pendulum", TIMES.tolist(), DATA, rates, states=4, guess=guess)
-    y, length = phases["p0"].at_start("y"), phases.declared.states["L"].symbol
+    y, length = phases["p0"].at_start("y"), phases["p0"].at_start("L")
     phases.end("length at the start", y[0] ** 2 + y[1] ** 2 - length**2, 0.0, 0.0)
     phases.end("rate of the length at the start", y[0] * y[2] + y[1] * y[3], 0.0, 0.0)
     return phases
