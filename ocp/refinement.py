@@ -182,20 +182,20 @@ def _refine_mesh(
         vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
         idle = min(vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
-        oscillates = moving and any(vain[name] >= settings.patience for name in driven & vain.keys())
-        if oscillates or (moving and idle >= settings.patience):  # nodes at switches do not help
-            moving, at_switches, idle, vain, best = False, None, 0, {}, {}
+        if moving and idle >= settings.patience:  # nodes at switches do not help
+            moving, at_switches, idle, best = False, None, 0, {}
         following = method
-        if oscillates and isinstance(method, Collocation):
-            # held over each interval, controls that oscillate on every mesh have no values but those of the solver
-            following = replace(method, control="held")
-        elif at_switches is not None:
+        if at_switches is not None:
             finer, placed = at_switches
             following = method.with_mesh(finer)
         elif idle < settings.patience:
             parts = _parts_per_interval(beyond, rows, method.fractions, settings)
             following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
-        unchanged = following.control == method.control and np.array_equal(following.fractions, method.fractions)
+        unchanged = np.array_equal(following.fractions, method.fractions)
+        vainly = max((vain[name] + settings.patience * unchanged for name in driven & vain.keys()), default=0)
+        if isinstance(method, Collocation) and method.control == "points" and vainly >= settings.patience:
+            # held over each interval, controls that oscillate on every mesh have no values but those of the solver
+            following, moving, unchanged, vain, best = replace(method, control="held"), False, False, {}, {}
         if not beyond or unchanged or len(intervals) == settings.rounds:
             break
         method = following
