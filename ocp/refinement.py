@@ -24,7 +24,7 @@ from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.solution_data import Refinement, stack
 from ocp.switching import locate_switches, nodes_at_switches
-from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
+from ocp.tolerances import RESOLVED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 INTEGRATION = "integration error, relative"
@@ -165,6 +165,8 @@ def _refine_mesh(
     moving = isinstance(method, Collocation) and method.control == "points"
     driven = {f"bounds of {name}" for name in solution.controls}
     driven |= {owner for owner, controlled in zip(form.path.owners, form.path.uses_control, strict=True) if controlled}
+    if (form.path.equality & form.path.uses_control).any():  # held controls cannot follow the states
+        driven = set()
 
     def assess() -> tuple[list[_Row], list[_Row]]:
         """Record the errors of the last plan; return all rows, and those beyond their limits."""
@@ -399,10 +401,14 @@ def _mesh_at_switches(
     at, smeared = locate_switches(problem, solution)
     if not beyond or not (np.abs(at[:, None] - mesh).min(axis=1, initial=np.inf) > settings.same_switch).any():
         return None
+    # a node beside a wide interval did not cure it; in a narrow one the switch may still be, as the cost is stationary
+    # in its time: a cost known to a share locates it to the root of this share
+    tried = np.isin(mesh[:-1], placed) | np.isin(mesh[1:], placed)
+    smeared &= ~tried | (np.diff(mesh) <= RESOLVED_SHARE**0.5)
     finer = mesh
     if any(row.errors is not None and (row.errors[~smeared] > 1.0).any() for row in beyond):
         parts, error = _parts_per_interval(beyond, rows, mesh, settings)
-        parts[smeared & ~np.isin(mesh[:-1], placed) & ~np.isin(mesh[1:], placed)] = 1
+        parts[smeared] = 1
         finer = split(mesh, parts, error, settings.max_intervals)
     own = np.clip(np.searchsorted(mesh, placed), 1, method.intervals - 1)
     replaced = ((mesh[own - 1, None] <= at) & (at <= mesh[own + 1, None])).any(axis=1)
