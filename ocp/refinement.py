@@ -184,8 +184,8 @@ def _refine_mesh(
         vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
         idle = min(vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
-        if moving and idle >= settings.patience:  # nodes at switches do not help
-            moving, at_switches, idle, best = False, None, 0, {}
+        if at_switches is not None and idle >= settings.patience:  # nodes at switches do not help
+            moving, at_switches, idle = False, None, 0
         following = method
         if at_switches is not None:
             finer, placed = at_switches
