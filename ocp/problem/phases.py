@@ -132,8 +132,8 @@ class Phases(Problem):
         horizon = declared.horizon
         assert horizon is not None
         total = float(constant(horizon.lower)[0]) if horizon.fixed else np.nan
-        if not _by_name("costs", costs) or not all(0.0 <= time <= total for time in costs):
-            raise ProblemError(f"{what}: costs at {sorted(costs)} s do not fit its horizon, {total} s", name="costs")
+        if not isinstance(costs, Mapping) or not all(0.0 <= time <= total for time in costs):
+            raise ProblemError(f"{what}: costs at {[*costs]} s do not fit its horizon, {total} s", name="costs")
         times = np.unique([0.0, *costs, total]).tolist()
         legs = {f"p{k}": _leg(problem, begin, end, total) for k, (begin, end) in enumerate(pairwise(times))}
         shared = [name for name, rate in declared.dynamics.items() if rate.is_zero()]
