@@ -222,8 +222,8 @@ class Linearisation:
         rates.append(np.abs(self.row_y[:, :, constant]).max(axis=0, initial=0.0) / sizes.path[:, None])
         rates += [np.abs(self.end_y[:, k]) / rows for k in (constant, nx + constant)]
         lam = form.sym("lam", nx)
-        slopes = ca.gradient(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)
-        diagonal = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in constant.tolist()])
+        hessian = ca.hessian(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)[0]
+        diagonal = ca.densify(ca.diag(hessian)[constant.tolist()])
         curvature = self.share @ form.sampled([diagonal], *self.point, (lam, self.costate))[0]
         curvature = curvature + sum(np.diag(self.final_yy)[k] for k in (constant, nx + constant))
         rates.append(np.sqrt(np.abs(curvature[None]) / 2 / (max(abs(self.solution.cost), sizes.cost) or 1.0)))
