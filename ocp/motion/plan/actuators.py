@@ -15,6 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from models import Robot
 from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
@@ -33,7 +34,7 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.tolerances import RESOLVED_SHARE
+from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE
 
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
@@ -89,21 +90,59 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
     torques_at = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
     samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
     torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
-    largest, demand = -np.inf, None
-    for quantity, values, most_allowed, units in (
-        ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
-        ("torque", np.abs(torques), bounds.torque, ("N m", "N")),
-        ("power", torques * sample.rates, bounds.power, ("W", "W")),
-    ):
-        ratios = values / most_allowed
-        row, joint = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-        if np.isfinite(most_allowed).any() and ratios[row, joint] > largest:
-            largest, name = ratios[row, joint], robot.joint_names[joint]
-            unit = units[robot.moving_joints[joint].kind == "prismatic"]
-            time, value, allowed = float(sample.t[row]), float(values[row, joint]), float(most_allowed[joint])
-            words = f"{quantity} of {name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
-            demand = Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
-    return demand
+    power = np.maximum(torques * sample.rates, 0.0)
+    demands = {"acceleration": sample.accelerations, "torque": torques, "power": power}
+    return max((_demand(robot, *of, sample.t, bounds) for of in demands.items()), key=_ratio)
+
+
+def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> Reason | None:
+    """Return the largest of values (M, n) of an actuator at M times, relative to its limits; None without limits."""
+    most_allowed = getattr(bounds, quantity)
+    if not np.isfinite(most_allowed).any():
+        return None
+    row, joint = np.unravel_index(int(np.argmax(np.abs(values) / most_allowed)), values.shape)
+    name, rotates = robot.joint_names[joint], robot.moving_joints[joint].kind != "prismatic"
+    units = {"torque": ("N", "N m"), "power": ("W", "W"), "acceleration": ("m/s^2", "rad/s^2")}
+    unit = units.get(quantity, ("m/s^3", "rad/s^3"))[rotates]
+    time, value, allowed = float(t[row]), float(abs(values[row, joint])), float(most_allowed[joint])
+    words = f"{quantity} of {name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
+    return Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
+
+
+def _ratio(demand: Reason | None) -> float:
+    """Return the ratio of a demand to its limit; 0 without a demand."""
+    return 0.0 if demand is None or demand.value is None or demand.limit is None else demand.value / demand.limit
+
+
+def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> Reason | None:
+    """Return an acceleration or jerk beyond its limit that the tasks demand of a joint, from the branch of a plan.
+
+    A joint that no self-motion moves at a random configuration is not moved at almost all configurations: the tasks
+    determine its motion. Divided differences of its velocity are values of its acceleration and jerk (mean value
+    theorem). Returns None on a floating base, with a free horizon, and if there is no such joint.
+    """
+    machine, demands = request.machine, list[Reason | None]()
+    if machine.base_size or request.time_cost is not None:
+        return None
+    configuration = np.random.default_rng(0).normal(size=machine.joint_size)
+    bounds = limits.bounds(machine)
+    for stretch in (stretch for stretch in request.stretches if stretch.equations is not None):
+        equations: Any = stretch.equations
+        free = _null_rows(np.array(equations.jacobian_function(configuration, ())))
+        determined = ~(np.abs(free) > ROUNDING_SHARE).any(axis=0)
+        ends = np.array([stretch.begin, *stretch.breaks, stretch.end])
+        t = np.append((ends[:-1, None] + np.diff(ends)[:, None] * np.arange(4) / 4).ravel(), stretch.end)
+        joints = unlimited.sampled(t).joints[:, [name not in unlimited.held for name in unlimited.names]]
+        targets = equations.target_function().map(len(t))(t[None, :])
+        jacobians, right, *_ = equations.function.map(len(t))(np.zeros((0, len(t))), joints.T, targets)
+        rows = np.array(jacobians).reshape(equations.size, len(t), -1).transpose(1, 0, 2)
+        rates = (np.linalg.pinv(rows) @ np.array(right).reshape(equations.size, len(t), 1).transpose(1, 0, 2))[:, :, 0]
+        accelerations = np.diff(rates, axis=0) / np.diff(t)[:, None]
+        jerks = 2 * np.diff(accelerations, axis=0) / (t[2:] - t[:-2])[:, None]
+        demands.append(_demand(machine.robot, "acceleration", determined * accelerations, t, bounds))
+        demands.append(_demand(machine.robot, "jerk", determined * jerks, t[1:], bounds))
+    demand = max(demands, key=_ratio, default=None)
+    return demand if _ratio(demand) > 1.0 + LIMIT_SHARE else None
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
@@ -118,6 +157,9 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
         SolveError: No motion was found. Names the joint, the time, the demand without the limit, and the limit.
     """
     limits = request.actuator_limits or request.limits
+    if (demand := demand_of_tasks(request, unlimited, limits)) is not None:
+        words = "the tasks determine the motion of this joint: lower the speed, acceleration or jerk of the tasks"
+        raise _with_demand(SolveError(words), demand)
     first = request.stretches[0]
     if request.start is None:
         # a joint that started elsewhere moves separated bodies: its start stays free
@@ -130,7 +172,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            actuation = Actuation(request.cost, request.rests, _undetermined_rows(request, unlimited))
+            rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
+            actuation = Actuation(request.cost, request.rests, rest_rows)
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited)
             return motion.problem
@@ -152,14 +195,21 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     return solution
 
 
-def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
-    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the end."""
-    last = request.stretches[-1]
-    if last.equations is None:
+def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan, end: int) -> Array:
+    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the start, if
+    `end` is 0, or at the end, if it is -1.
+    """
+    stretch = request.stretches[end]
+    if stretch.equations is None:
         return np.eye(request.machine.joint_size)
-    names = [f"{kind}{last.suffix}" for kind in ("base", "joints")]
-    base, joints = (unlimited.solution[name][-1] if name in unlimited.solution.states else () for name in names)
-    _, sizes, rows = np.linalg.svd(np.array(last.equations.jacobian_function(joints, base)))
+    names = [f"{kind}{stretch.suffix}" for kind in ("base", "joints")]
+    base, joints = (unlimited.solution[name][end] if name in unlimited.solution.states else () for name in names)
+    return _null_rows(np.array(stretch.equations.jacobian_function(joints, base)))
+
+
+def _null_rows(jacobian: Array) -> Array:
+    """Return orthonormal rows (k, n) that span the null space of a Jacobian (m, n)."""
+    _, sizes, rows = np.linalg.svd(jacobian)
     return np.asarray(rows[int((sizes > RESOLVED_SHARE * sizes.max(initial=0.0)).sum()) :])
 
 
