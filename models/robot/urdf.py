@@ -449,7 +449,8 @@ def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int, *
             raise ValueError
         values = [float(word) for word in text.split()]
     except ValueError:
-        hint = f": {XACRO}" if "${" in text or "$(" in text else ""
+        hint = ": write decimal points, and blanks between numbers" if "," in text else ""
+        hint = f": {XACRO}" if "${" in text or "$(" in text else hint
         raise ModelError(f"{place} is not numeric{hint}", name=key, value=text) from None
     if len(values) != count:
         raise ModelError(f"{place} has {len(values)} numbers, not {count}", name=key, value=text, limit=count)

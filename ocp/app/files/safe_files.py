@@ -175,7 +175,7 @@ def read_tree(file: FileName, kind: str) -> Any:
         if kind != "json":
             return _yaml(text)
         _check_count(sum(text.count(sign) for sign in ",[{"))
-        return checked_depth(json.loads(text))
+        return checked_depth(json.loads(text, object_pairs_hook=_distinct))
     except RecursionError as error:
         raise ProblemError(
             f"{file} is nested too deeply", name="file", value=str(file), limit=INPUT_LIMITS.nesting
@@ -184,6 +184,14 @@ def read_tree(file: FileName, kind: str) -> Any:
         if isinstance(error, ProblemError):
             raise
         raise ProblemError(f"{file} is not valid {kind.upper()}: {error}", name="file", value=str(file)) from error
+
+
+def _distinct(entries: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the entries of a JSON object as a dictionary; raise ValueError if two of them have the same name."""
+    if len(found := dict(entries)) < len(entries):
+        names = [name for name, _ in entries]
+        raise ValueError(f"{next(n for n in names if names.count(n) > 1)!r} is there twice; remove one of the two")
+    return found
 
 
 def _yaml(text: str) -> Any:
@@ -215,6 +223,8 @@ class _Container:
                 raise ValueError("a key must be a text or number")
             if value == "<<":
                 raise ValueError("merged mappings (<<) are not supported; write out their entries")
+            if value in self.value:
+                raise ValueError(f"{value!r} is there twice in a mapping; remove one of the two")
             self.key = value
         else:
             self.value[self.key], self.key = value, _NO_KEY
