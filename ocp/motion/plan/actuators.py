@@ -32,9 +32,10 @@ from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.speed_profile import ramp_time
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE
+from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
 
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
@@ -115,17 +116,22 @@ def _ratio(demand: Reason | None) -> float:
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return an acceleration or jerk beyond its limit that the tasks demand of a joint, from the branch of a plan.
+    """Return a demand of the tasks on a joint beyond its limit, from the branch of a plan: of acceleration, of jerk, or
+    of torque at rest.
 
     A joint that no self-motion moves at a random configuration is not moved at almost all configurations: the tasks
     determine its motion. Divided differences of its velocity are values of its acceleration and jerk (mean value
-    theorem). Returns None on a floating base, with a free horizon, and if there is no such joint.
+    theorem). In the same way, the tasks determine a gravity torque that no self-motion changes. Returns None on a
+    floating base, with a free horizon, and if there is no such joint.
     """
     machine, demands = request.machine, list[Reason | None]()
     if machine.base_size or request.time_cost is not None:
         return None
     configuration = np.random.default_rng(0).normal(size=machine.joint_size)
-    bounds = limits.bounds(machine)
+    bounds, q = limits.bounds(machine), ca.SX.sym("q", machine.joint_size)
+    zeros = np.zeros(machine.joint_size)
+    gravity = joint_torques(checked_motors("limits", machine), ((), q, zeros, zeros))
+    gravity_at = ca.Function("gravity", [q], [gravity, ca.jacobian(gravity, q)])
     for stretch in (stretch for stretch in request.stretches if stretch.equations is not None):
         equations: Any = stretch.equations
         free = _null_rows(np.array(equations.jacobian_function(configuration, ())))
@@ -139,6 +145,11 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
         rates = (np.linalg.pinv(rows) @ np.array(right).reshape(equations.size, len(t), 1).transpose(1, 0, 2))[:, :, 0]
         accelerations = np.diff(rates, axis=0) / np.diff(t)[:, None]
         jerks = 2 * np.diff(accelerations, axis=0) / (t[2:] - t[:-2])[:, None]
+        holds = [stretch is request.stretches[-k] and rests for k, rests in enumerate(request.rests)]
+        slopes = gravity_at(configuration)[1].full()
+        fixed = (np.abs(slopes @ free.T) <= ROUNDING_SHARE * np.abs(slopes).max()).all(axis=1)
+        static = np.array([rests * gravity_at(joints[-k])[0].full().ravel() for k, rests in enumerate(holds)])
+        demands.append(_demand(machine.robot, "torque", fixed * static, t[[0, -1]], bounds))
         demands.append(_demand(machine.robot, "acceleration", determined * accelerations, t, bounds))
         demands.append(_demand(machine.robot, "jerk", determined * jerks, t[1:], bounds))
     demand = max(demands, key=_ratio, default=None)
@@ -159,6 +170,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     limits = request.actuator_limits or request.limits
     if (demand := demand_of_tasks(request, unlimited, limits)) is not None:
         words = "the tasks determine the motion of this joint: lower the speed, acceleration or jerk of the tasks"
+        if demand.detail.startswith("torque"):
+            words = "the arm must hold itself at rest there: reduce its load, or move the tasks"
         raise _with_demand(SolveError(words), demand)
     first = request.stretches[0]
     if request.start is None:
@@ -167,12 +180,13 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
         start = np.where(np.isclose(initial, start, rtol=0.0), start, np.nan)
 
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
-    breaks = np.unique(np.concatenate([np.zeros(0), *fractions])).tolist()
+    rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
+    ramps = _ramps(request, unlimited, limits, rest_rows)
+    breaks = np.unique(np.concatenate([ramps, *fractions])).tolist()
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
             actuation = Actuation(request.cost, request.rests, rest_rows)
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited)
@@ -193,6 +207,24 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
             raise
         raise _with_demand(error, largest_demand(unlimited, limits)) from error
     return solution
+
+
+def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
+    """Return the ends of the fastest ramps between rest and a self-motion at the ends of a plan, and their middles, as
+    shares of the horizon. Limited jerks switch there.
+    """
+    horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
+    fastest = 1.0 / STANDSTILL
+    rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
+    for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
+        speeds = np.abs(rows.T @ (rows @ rates[k, [name not in unlimited.held for name in unlimited.names]]))
+        times = [
+            ramp_time(float(speed), min(acceleration, fastest), min(jerk, fastest))
+            for speed, acceleration, jerk in zip(speeds, bounds.acceleration, bounds.jerk, strict=True)
+        ]
+        share = rests * max(times, default=0.0) / horizon
+        shares += [abs(k - place) for place in (share / 2, share) if RESOLVED_SHARE < place < 0.5]
+    return np.array(shares)
 
 
 def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan, end: int) -> Array:
