@@ -175,7 +175,7 @@ def read_tree(file: FileName, kind: str) -> Any:
         if kind != "json":
             return _yaml(text)
         _check_count(sum(text.count(sign) for sign in ",[{"))
-        return checked_depth(json.loads(text, object_pairs_hook=_distinct))
+        return checked_depth(json.loads(text))
     except RecursionError as error:
         raise ProblemError(
             f"{file} is nested too deeply", name="file", value=str(file), limit=INPUT_LIMITS.nesting
@@ -184,14 +184,6 @@ def read_tree(file: FileName, kind: str) -> Any:
         if isinstance(error, ProblemError):
             raise
         raise ProblemError(f"{file} is not valid {kind.upper()}: {error}", name="file", value=str(file)) from error
-
-
-def _distinct(entries: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the entries of a JSON object as a dictionary; raise ValueError if two of them have the same name."""
-    if len(found := dict(entries)) < len(entries):
-        names = [name for name, _ in entries]
-        raise ValueError(f"{next(n for n in names if names.count(n) > 1)!r} is there twice; remove one of the two")
-    return found
 
 
 def _yaml(text: str) -> Any:

@@ -10,7 +10,8 @@ of the squared rates is then the guess of one motion, and the lowest of their co
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -37,7 +38,12 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
 
+_Demand: TypeAlias = tuple[float, Reason | None]
+
 ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
+
+
+_ratio = itemgetter(0)
 
 
 def limits_actuators(limits: Limits) -> bool:
@@ -81,10 +87,9 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.
     """
-    machine = checked_motors("limits", plan.machine)
-    robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
+    machine, unlimited = checked_motors("limits", plan.machine), dict.fromkeys(plan.held, np.inf)
     own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
-    bounds = JointBounds(*(all_joints(robot, unlimited, values) for values in own))
+    bounds = JointBounds(*(all_joints(machine.robot, unlimited, values) for values in own))
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
     symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
@@ -93,26 +98,23 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
     torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
     power = np.maximum(torques * sample.rates, 0.0)
     demands = {"acceleration": sample.accelerations, "torque": torques, "power": power}
-    return max((_demand(robot, *of, sample.t, bounds) for of in demands.items()), key=_ratio)
+    return max((_demand(machine.robot, *of, sample.t, bounds) for of in demands.items()), key=_ratio)[1]
 
 
-def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> Reason | None:
-    """Return the largest of values (M, n) of an actuator at M times, relative to its limits; None without limits."""
+def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> _Demand:
+    """Return the largest ratio of values (M, n) of an actuator at M times to its limits, and the reason that states it;
+    (0, None) without limits.
+    """
     most_allowed = getattr(bounds, quantity)
     if not np.isfinite(most_allowed).any():
-        return None
+        return 0.0, None
     row, joint = np.unravel_index(int(np.argmax(np.abs(values) / most_allowed)), values.shape)
     name, rotates = robot.joint_names[joint], robot.moving_joints[joint].kind != "prismatic"
     units = {"torque": ("N", "N m"), "power": ("W", "W"), "acceleration": ("m/s^2", "rad/s^2")}
     unit = units.get(quantity, ("m/s^3", "rad/s^3"))[rotates]
     time, value, allowed = float(t[row]), float(abs(values[row, joint])), float(most_allowed[joint])
     words = f"{quantity} of {name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
-    return Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
-
-
-def _ratio(demand: Reason | None) -> float:
-    """Return the ratio of a demand to its limit; 0 without a demand."""
-    return 0.0 if demand is None or demand.value is None or demand.limit is None else demand.value / demand.limit
+    return value / allowed, Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> Reason | None:
@@ -124,12 +126,11 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
     theorem). In the same way, the tasks determine a gravity torque that no self-motion changes. Returns None on a
     floating base, with a free horizon, and if there is no such joint.
     """
-    machine, demands = request.machine, list[Reason | None]()
+    machine, demands = request.machine, list[_Demand]()
     if machine.base_size or request.time_cost is not None:
         return None
     configuration = np.random.default_rng(0).normal(size=machine.joint_size)
-    bounds, q = limits.bounds(machine), ca.SX.sym("q", machine.joint_size)
-    zeros = np.zeros(machine.joint_size)
+    bounds, q, zeros = limits.bounds(machine), ca.SX.sym("q", machine.joint_size), np.zeros(machine.joint_size)
     gravity = joint_torques(checked_motors("limits", machine), ((), q, zeros, zeros))
     gravity_at = ca.Function("gravity", [q], [gravity, ca.jacobian(gravity, q)])
     for stretch in (stretch for stretch in request.stretches if stretch.equations is not None):
@@ -137,7 +138,7 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
         free = _null_rows(np.array(equations.jacobian_function(configuration, ())))
         determined = ~(np.abs(free) > ROUNDING_SHARE).any(axis=0)
         ends = np.array([stretch.begin, *stretch.breaks, stretch.end])
-        t = np.append((ends[:-1, None] + np.diff(ends)[:, None] * np.arange(4) / 4).ravel(), stretch.end)
+        t = np.interp(np.arange(4 * len(ends) - 3) / 4, np.arange(len(ends)), ends)
         joints = unlimited.sampled(t).joints[:, [name not in unlimited.held for name in unlimited.names]]
         targets = equations.target_function().map(len(t))(t[None, :])
         jacobians, right, *_ = equations.function.map(len(t))(np.zeros((0, len(t))), joints.T, targets)
@@ -145,15 +146,16 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
         rates = (np.linalg.pinv(rows) @ np.array(right).reshape(equations.size, len(t), 1).transpose(1, 0, 2))[:, :, 0]
         accelerations = np.diff(rates, axis=0) / np.diff(t)[:, None]
         jerks = 2 * np.diff(accelerations, axis=0) / (t[2:] - t[:-2])[:, None]
-        holds = [stretch is request.stretches[-k] and rests for k, rests in enumerate(request.rests)]
         slopes = gravity_at(configuration)[1].full()
         fixed = (np.abs(slopes @ free.T) <= ROUNDING_SHARE * np.abs(slopes).max()).all(axis=1)
-        static = np.array([rests * gravity_at(joints[-k])[0].full().ravel() for k, rests in enumerate(holds)])
-        demands.append(_demand(machine.robot, "torque", fixed * static, t[[0, -1]], bounds))
-        demands.append(_demand(machine.robot, "acceleration", determined * accelerations, t, bounds))
-        demands.append(_demand(machine.robot, "jerk", determined * jerks, t[1:], bounds))
-    demand = max(demands, key=_ratio, default=None)
-    return demand if _ratio(demand) > 1.0 + LIMIT_SHARE else None
+        static = gravity_at.map(2)(joints[[0, -1]].T)[0].full().T
+        holds = [stretch is request.stretches[-k] and rests for k, rests in enumerate(request.rests)]
+        at_rest = np.array(holds)[:, None] * fixed * static
+        of_kinds = ("torque", at_rest, t[[0, -1]]), ("acceleration", determined * accelerations, t)
+        for of in (*of_kinds, ("jerk", determined * jerks, t[1:])):
+            demands.append(_demand(machine.robot, *of, bounds))
+    largest, demand = max(demands, key=_ratio, default=(0.0, None))
+    return demand if largest > 1.0 + LIMIT_SHARE else None
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
@@ -214,15 +216,11 @@ def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_row
     shares of the horizon. Limited jerks switch there.
     """
     horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
-    fastest = 1.0 / STANDSTILL
     rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
+    fastest = [np.minimum(most, 1.0 / STANDSTILL).tolist() for most in (bounds.acceleration, bounds.jerk)]
     for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
         speeds = np.abs(rows.T @ (rows @ rates[k, [name not in unlimited.held for name in unlimited.names]]))
-        times = [
-            ramp_time(float(speed), min(acceleration, fastest), min(jerk, fastest))
-            for speed, acceleration, jerk in zip(speeds, bounds.acceleration, bounds.jerk, strict=True)
-        ]
-        share = rests * max(times, default=0.0) / horizon
+        share = rests * max(map(ramp_time, speeds.tolist(), *fastest)) / horizon
         shares += [abs(k - place) for place in (share / 2, share) if RESOLVED_SHARE < place < 0.5]
     return np.array(shares)
 

@@ -115,7 +115,6 @@ def test_mistakes_in_a_urdf_name_the_part(
         ("move.csv", CSV.split("\n")[0] + "\n", ("no sample",)),
         ("move.csv", "PK\x03\x04\0", ("zero bytes",)),
         ("move.json", '{"joint_names": ["a", "a"], "points": []}', ("distinct names",)),
-        ("move.json", '{"points": [], "points": []}', ("'points' is there twice",)),
         ("move.json", "[" * 10_000, ("nest",)),
         ("names.srdf", SRDF.replace(' link2="hand"', ""), ("disable_collisions", "link2")),
         ("names.srdf", URDF, ("it is a URDF",)),
