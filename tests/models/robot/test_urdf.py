@@ -157,10 +157,10 @@ def test_a_rotation_is_written_exactly_to_rounding_at_the_gimbal_lock_too(
 @pytest.mark.parametrize("limits", [{}, {"effort": 3.0}, {"velocity": 2.0}, {"effort": 0.0, "velocity": 2.0}])
 @pytest.mark.parametrize("ends", [{}, {"lower": -1.0}, {"upper": 2.0}, {"lower": -1.0, "upper": 2.0}])
 def test_pinocchio_and_mujoco_read_joints_with_any_of_the_limits(
-    kind: Any, limits: dict[str, float], ends: dict[str, float]
+    kind: Any, limits: dict[str, Any], ends: dict[str, Any]
 ) -> None:
     ends = {} if kind == "continuous" else ends
-    body = {"mass": 1.0, "inertia": np.eye(3)}
+    body: dict[str, Any] = {"mass": 1.0, "inertia": np.eye(3)}
     robot = Robot((Link("a", **body), Link("b", **body)), (Joint("j", kind, "a", "b", **limits, **ends),), "b")
     text = robot.to_urdf()
     peer = pinocchio.buildModelFromXML(text)

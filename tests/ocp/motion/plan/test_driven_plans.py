@@ -110,7 +110,7 @@ def line_task(acceleration: float = 0.5, jerk: float = 4.0) -> TipTask:
     return TipTask.along(path, 0.1, acceleration=acceleration, jerk=jerk, direction=(0, 0, -1))
 
 
-@pytest.mark.parametrize("quantity", ["acceleration", "jerk"])
+@pytest.mark.parametrize("quantity", ["acceleration", pytest.param("jerk", marks=pytest.mark.long)])
 def test_limits_below_what_a_task_determines_are_refused_with_its_demand(quantity: str) -> None:
     """At the limit of the demand itself the motion is planned, and it is the motion without limits."""
     task = line_task()
@@ -156,6 +156,7 @@ def plan_end(start: Array) -> Array:
     return np.asarray(result.at(result.horizon)["joints"])
 
 
+@pytest.mark.long
 def test_joints_at_rest_have_no_acceleration_if_their_jerk_is_limited() -> None:
     """An acceleration that jumps at the start or at the end is an unlimited jerk there."""
     free = plan(FIXED, smooth_task(FIXED), start=START)
