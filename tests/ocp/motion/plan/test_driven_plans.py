@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,10 @@ def test_infeasible_tasks_are_named_with_their_requirement() -> None:
     assert 0 < caught.value.time < SECONDS
 
 
+def limited(quantity: str, most: Any) -> Limits:
+    return replace(Limits(), **{quantity: most})
+
+
 def line_task(acceleration: float = 0.5, jerk: float = 4.0) -> TipTask:
     """Along y with a free roll about the last axis of the arm, so that the task determines all other joints."""
     path = smooth(CornerPath.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3)]), 0.002)
@@ -122,16 +127,16 @@ def test_limits_below_what_a_task_determines_are_refused_with_its_demand(quantit
     joint = int(np.abs(values).max(axis=0).argmax())
     most = float(np.abs(values[:, joint]).max())
     with pytest.raises(SolveError, match="the tasks determine the motion of this joint: lower the speed") as caught:
-        plan(SIX_AXIS, task, start=start, limits=Limits(**{quantity: 0.9 * most}))
+        plan(SIX_AXIS, task, start=start, limits=limited(quantity, 0.9 * most))
     error = caught.value
     assert (error.name, error.limit) == (free.names[joint], pytest.approx(0.9 * most))
     assert error.value == pytest.approx(most, rel=0.01)
     assert np.abs(values[np.abs(sample.t - error.time) < 0.02, joint]).max() > 0.9 * most
-    limited = plan(SIX_AXIS, task, start=start, limits=Limits(**{quantity: 1.02 * most}))
-    assert limited.audit().passed
-    assert limited.cost == pytest.approx(free.cost, rel=1e-4)
+    result = plan(SIX_AXIS, task, start=start, limits=limited(quantity, 1.02 * most))
+    assert result.audit().passed
+    assert result.cost == pytest.approx(free.cost, rel=1e-4)
     with pytest.raises(SolveError, match="the tasks determine"):
-        plan(SIX_AXIS, task, start=start, limits=Limits(**{quantity: np.where(np.arange(6) == joint, 0.5, 1e3)}))
+        plan(SIX_AXIS, task, start=start, limits=limited(quantity, np.where(np.arange(6) == joint, 0.5, 1e3)))
 
 
 def test_a_payload_that_the_arm_cannot_hold_at_rest_is_refused_with_the_torque_there() -> None:
