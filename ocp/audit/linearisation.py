@@ -304,21 +304,23 @@ class Linearisation:
         """
         form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
         arcs = np.zeros((len(self.s), len(equal), form.nu))
-        for which, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
-            rates = [form.signals_at(self.t, order) for order in range(MAX_DERIVATIVES + 1 if form.signals else 1)]
+        for which, orders, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
+            rates = [form.signals_at(self.t, order) for order in range(orders + 1)]
             values = slopes(*self.point[:2], self.t[:, None], *self.point[3:5], *rates)[0]
             arcs[:, which] = values.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
         self.control_limits_u = np.concatenate([self.control_limits_u, arcs], axis=1)
         self.control_limits.extend(len(equal))
 
 
-def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
+def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, int, Sampler]]:
     """Group path constraints by their order, the number of time derivatives until a control appears.
 
     Returns:
-        For each order the indices of its rows, and a sampler of the derivatives of these with respect to the controls.
+        For each order the indices of its rows, a sampler of the derivatives of these with respect to the controls, and
+        before it the highest order of the time derivatives of signals that the sampler takes as arguments.
     """
-    at, remaining, arcs = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
+    at, remaining = form.path.expression[rows.tolist()], np.arange(len(rows))
+    arcs = list[tuple[np.ndarray, int, Sampler]]()
     rates = [form.sym("w_rate", form.w.numel()) for _ in range(MAX_DERIVATIVES)] if form.signals else []
     for _ in range(MAX_DERIVATIVES):
         if not remaining.size or not form.nu:
@@ -328,7 +330,9 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
         in_control = ca.jacobian(at, form.u)
         seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
         if seen.any():
-            arcs.append((remaining[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
+            slopes = in_control[np.flatnonzero(seen).tolist(), :]
+            orders = max((k + 1 for k, rate in enumerate(rates) if ca.depends_on(slopes, rate)), default=0)
+            arcs.append((remaining[seen], orders, form.sampler([slopes], *rates[:orders])))
             at, remaining = at[np.flatnonzero(~seen).tolist()], remaining[~seen]
     return arcs
 

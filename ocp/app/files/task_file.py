@@ -15,12 +15,12 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
+from warnings import warn
 
 import numpy as np
 
 import models
-from models import FreeFloating, Machine, Robot, SmoothPath
-from models.checks import warn_of_millimetres
+from models import FreeFloating, Machine, ModelWarning, Robot, SmoothPath, checks
 from models.machines.standing import tip_spring
 from ocp.app.files import settings
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
@@ -367,7 +367,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
         return _located(entries, "file", poses.smooth, deviation)  # type: ignore[no-any-return]
     if len(corners) < 2:
         raise entries.error("points", f"points must be {words}")
-    warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
+    checks.warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
     return _located(entries, "points", partial(models.smooth, deviation=deviation), models.Path.through(corners))
 
 
@@ -376,7 +376,11 @@ def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
     name = entries.text("file", "the name of a file of waypoints", REQUIRED)
     if not (folder / name).is_file():
         raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
-    return _located(entries, "file", read_waypoints, folder / name)
+    poses = _located(entries, "file", read_waypoints, folder / name)
+    if poses.ignored:
+        words = f"{folder / name}: unknown columns {', '.join(poses.ignored)} are ignored"
+        warn(ModelWarning(words, name=name), stacklevel=2)
+    return poses
 
 
 def _goal(entries: TomlTable, folder: Path, machine: Machine) -> Goal:
@@ -391,8 +395,7 @@ def _waypoints(entries: TomlTable, folder: Path, machine: Machine) -> Waypoints:
     """Read the table [waypoints] of a task file and return the waypoints of the planner."""
     poses = _read_waypoints(entries, folder)
     if poses.orientations is None or poses.free_roll:
-        words = "waypoints without a path need whole orientations: quaternions in columns qw, qx, qy, qz"
-        raise entries.error("file", words)
+        raise entries.error("file", "[waypoints] need whole orientations: quaternions in columns qw, qx, qy, qz")
     return entries.build(partial(Waypoints, poses.positions, poses.orientations), WAYPOINTS)
 
 
@@ -401,8 +404,7 @@ def _walk(entries: TomlTable, folder: Path, machine: Machine) -> Steps:
     feet, start, steps = {}, {}, []
 
     def foothold(table: TomlTable) -> models.Foothold:
-        place = table.vector("at", 4, "four numbers: x, y (m), heading (rad), height (m)", REQUIRED)
-        return models.Foothold.level(*place)
+        return models.Foothold.level(*table.vector("at", 4, "four numbers: x, y, heading, height; m, rad", REQUIRED))
 
     for name, table in entries.tables_by_name("feet").items():
         sole = table.vector("sole", 4, "four numbers, m: least and greatest x, least and greatest y")

@@ -211,8 +211,11 @@ def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, optio
         try:
             result = _plan(machine, tasks, horizon, scene, replace(options, limits=own))
         except SolveError as error:
-            words = f"obstacles enlarged by {reserve['distance']:g} m and torque limits {tightened.tolist()} leave "
-            error.args = (f"{words}room for the uncertainties, but {error}",)
+            stricter = [f"obstacles enlarged by {reserve['distance']:g} m"] if reserve["distance"] else []
+            stricter += [] if tightened is torque else [f"torque limits of {np.round(tightened, 4).tolist()}"]
+            covered = ", ".join(f"{name} {size:g}" for name, size in sizes.items())
+            words = f"no motion covers {covered}: with {' and '.join(stricter) or 'the limits as they are'}, "
+            error.args = (f"{words}{error}",)
             raise
         parts = [piece.plan for piece in result.pieces] if isinstance(result, ConsecutivePlans) else [result]
         for problem in (part.solution.problem for part in parts):

@@ -163,7 +163,7 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, expected: st
 
 def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
     with pytest.warns(ModelWarning, match="is it in millimetres"):
-        read(tmp_path, "[path]\npoints = [[400, -200, 300], [400, 100, 300]]\nspeed = 50\n")
+        read(tmp_path, "[path]\npoints = [[400, -200, 300], [400, 100, 300]]\nspeed = 50\nsteady = true\n")
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:
