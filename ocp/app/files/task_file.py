@@ -33,7 +33,7 @@ from ocp.motion.builders.standing.stances import Steps, walk
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.result.margin import checked_uncertainty
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
+from ocp.motion.tasks.goals import PER_JOINT, TERMS, Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import ramp_limits
@@ -181,8 +181,8 @@ LIMITS: Readers = {
 }
 COST: Readers = {
     "weights": (joint_values, 1.0, (f"a number above 0, {BY_JOINT}", 0.0)),
-    **dict.fromkeys(("effort", "acceleration"), (joint_values, 0.0, (WEIGHT, -1e-300))),
-    **dict.fromkeys(("velocity", "time", "length", "energy", "jerk", "turning"), (TomlTable.nonnegative, "a weight")),
+    **dict.fromkeys(TERMS, (TomlTable.nonnegative, "a weight")),
+    **dict.fromkeys(PER_JOINT, (joint_values, 0.0, (WEIGHT, -1e-300))),
 }
 SEARCH: Readers = {
     "cyclic": (TomlTable.flag,),

@@ -43,7 +43,7 @@ from ocp.motion.tasks.checks import (
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.goals import Cost
+from ocp.motion.tasks.goals import PER_JOINT, Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
@@ -195,15 +195,14 @@ def declare_actuators(
 
 def weights_torques(cost: Cost) -> bool:
     """Return whether a cost depends on joint torques."""
-    return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
+    return bool({"effort", "energy"} & set(cost.terms))
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
     """Return the cost per second of a motion, without the terms of duration and positive power, as an expression."""
     (base, joints, rates, second), n = motion, machine.joint_size
-    running = ca.dot(
-        ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
-    )
+    effort, acceleration = (require.broadcast(f"cost: {name}", getattr(cost, name), n, "joints") for name in PER_JOINT)
+    running = ca.dot(ca.DM(acceleration), second**2)
     if cost.velocity:
         running += ca.dot(ca.DM(cost.joint_weights(n)), rates**2) / 2
     if cost.length:
@@ -213,10 +212,8 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
     if cost.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += cost.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
-    if np.any(np.asarray(cost.effort)):
-        running += ca.dot(
-            ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
-        )
+    if effort.any():
+        running += ca.dot(ca.DM(effort), torques**2)
     return running
 
 
