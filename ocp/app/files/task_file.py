@@ -34,7 +34,7 @@ from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.result.margin import checked_uncertainty
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.goals import PER_JOINT, TERMS, Cost, Goal, Scene, Start, Waypoints
-from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
+from ocp.motion.tasks.limits import LIMITED, Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import ramp_limits
 
@@ -169,11 +169,7 @@ ZMP_RULES: Readers = {
 }
 LIMITS: Readers = {
     "joints": (lambda entries, name: entries.flag("positions", True),),
-    "velocity": (joint_values, np.inf, (f"a number above 0, rad/s or m/s, {BY_JOINT}", 0.0)),
-    "acceleration": (joint_values, np.inf, (f"a number above 0, rad/s^2 or m/s^2, {BY_JOINT}", 0.0)),
-    "jerk": (joint_values, np.inf, (f"a number above 0, rad/s^3 or m/s^3, {BY_JOINT}", 0.0)),
-    "torque": (joint_values, np.inf, (f"a number above 0, N m or N, {BY_JOINT}", 0.0)),
-    "power": (joint_values, np.inf, (f"a number above 0, W, {BY_JOINT}", 0.0)),
+    **{kind: (joint_values, np.inf, (f"a number above 0, {unit}, {BY_JOINT}", 0.0)) for kind, unit in LIMITED.items()},
     "vertical_force": (TomlTable.positive, "N"),
     "friction": (TomlTable.positive, "the friction coefficient of the ground"),
     "zmp": (_zmp_rule,),

@@ -31,7 +31,7 @@ from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.goals import Cost
-from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.limits import LIMITED, JointBounds, Limits
 from ocp.motion.tasks.speed_profile import ramp_time
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
@@ -46,11 +46,11 @@ class _Demand(NamedTuple):
     reason: Reason | None = None
 
 
-ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
+ACTUATOR_LIMITS = tuple(kind for kind in LIMITED if kind != "velocity")
 
 
 def limits_actuators(limits: Limits) -> bool:
-    """Return whether the acceleration, jerk, torque or power of joints is limited."""
+    """Return whether a quantity of the joints other than their positions and velocities is limited."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
@@ -60,8 +60,9 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return a copy of the limits of a motion without those of acceleration, jerk, torque and power."""
-    return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
+    """Return a copy of the limits of a motion without those in `ACTUATOR_LIMITS`."""
+    none: dict[str, Any] = dict.fromkeys(ACTUATOR_LIMITS)
+    return replace(limits, **none)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:

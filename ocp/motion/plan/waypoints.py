@@ -39,7 +39,7 @@ from ocp.motion.search.steps import Steps
 from ocp.motion.search.task_search import TOO_MANY_CHARTS, lower_bound_along, tool_motion_bound
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import LIMITED, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
 WAYPOINT = "waypoint {:g}"
@@ -120,7 +120,7 @@ def plan_path(
         words += f"Cost(velocity=0, time=1), not {own_cost}"
         raise ProblemError(words, name="cost", value=own_cost)
     is_timed = own_cost.terms == ("time",)
-    for quantity in ("velocity", "acceleration", "jerk", "torque", "power"):
+    for quantity in LIMITED:
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
