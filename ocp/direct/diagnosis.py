@@ -130,7 +130,7 @@ def diagnosis(
 
 
 def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]) -> list[str]:
-    """Return labels of declared constraints whose gradients are linearly dependent, with the time, the largest first.
+    """Return labels, with times, of constraints with linearly dependent gradients, in decreasing order of weight.
 
     They are the constraints with large entries in a vector y with J^T y = 0, found by inverse iteration with J J^T; J
     is the Jacobian of the equations, with rows of length 1, in the variables that are not fixed.

@@ -136,7 +136,7 @@ def unit_scales(transcription: Transcription) -> Scales:
 
 
 def scaled_program(program: Program) -> Program:
-    """Return the nonlinear program with variables, constraints and cost divided by scales, its new parameters.
+    """Return the nonlinear program with variables, constraints and cost divided by scales, which become parameters.
 
     The variables are x / a, the rows g / b, the cost f / c and the parameters (p, a, b, c). Only the functions that
     solvers use are replaced.
@@ -169,7 +169,7 @@ def scaled_program(program: Program) -> Program:
 def sizes_along(
     pattern: Pattern, point: np.ndarray, intended: Collection[str], *, bounds: Bounds, p: np.ndarray
 ) -> Sizes:
-    """Return the typical sizes of states, controls and horizon, derived from an initial point of the solver.
+    """Return the typical magnitudes of states, controls and horizon, derived from the solver's initial point.
 
     Args:
         point: Values of the variables.
@@ -223,7 +223,7 @@ def sizes_along(
 
 
 def _displaced(pattern: Pattern, point: np.ndarray, sizes: np.ndarray, ends: Bounds) -> np.ndarray:
-    """Return the point with states and controls displaced by a constant share of their range, their size, or 1.
+    """Return a point of the program with each state and control displaced by a share of its magnitude, range or 1.
 
     A derivative such as the cosine of a right angle may vanish at the guess, but does so nowhere near it.
 

@@ -219,7 +219,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare path constraints at every node; at the first node, only those that fixed initial states leave open.
+        """Declare path constraints at every mesh node; at the first, only those that fixed initial states leave open.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """

@@ -339,10 +339,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
 def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Return the gradients of the terminal cost plus the start and end constraints times their multipliers.
-
-    They are with respect to the parameters, the horizon, the first state and the last state.
-    """
+    """Differentiate terminal cost plus multipliers times end constraints by parameters, horizon and both end states."""
     form = ham.form
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
