@@ -142,7 +142,7 @@ def error_names(name: str) -> Iterator[None]:
 
 @contextmanager
 def problem_errors(prefix: str = "") -> Iterator[None]:
-    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields and a message after a prefix."""
+    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields, and a prefix to its message."""
     try:
         yield
     except ModelError as error:

@@ -169,7 +169,7 @@ def _refine_mesh(
         driven = set()
 
     def assess() -> tuple[list[_Row], list[_Row]]:
-        """Record the errors of the last plan; return all rows, and those beyond their limits."""
+        """Record the errors of the last plan; return all of these errors, and those that exceed their limits."""
         rows = _rows(form, p, solution, audit, tolerance, method)
         intervals.append(method.intervals)
         for kind, values in errors.items():
@@ -313,7 +313,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions scaled to the maximum (or, if summed, to the mean) ``total``. Shape (N,)."""
+        """Return the contributions scaled so that their maximum (their mean if summed) is ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))

@@ -138,7 +138,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack the arrays (M, n) of a dictionary side by side; an empty dictionary gives an array of shape (like, 0)."""
+    """Stack the arrays (M, n) of a dictionary side by side; an empty dictionary gives ``like`` rows without columns."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
