@@ -253,7 +253,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples; those above `near` are lower bounds. Shape (M, n), m.
+        """Return the distances of all pairs of bodies at all samples, as lower bounds above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -278,7 +278,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of pairs at given samples; those above `near` are lower bounds. Shape (K,), m."""
+        """Return the distances of pairs of bodies at given samples, as lower bounds above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -303,7 +303,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return each pair's smallest gap along its separating direction over several samples. Shape (K,), m.
+        """Return the smallest gap of each pair of bodies along a fixed direction over several samples. Shape (K,), m.
 
         The same row must separate the bodies at all samples; otherwise nothing follows for the times between.
         """
@@ -433,7 +433,7 @@ class Separation:
 
     @property
     def bodies(self) -> tuple[Hull, ...]:
-        """The bodies, in the order of their indices."""
+        """Hulls of all bodies of the declaration, in the order of their indices."""
         return tuple(self.hulls.values())
 
     @property

@@ -386,7 +386,7 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
 
 
 def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Yield the entries that describe symbols from a record of declarations."""
+    """Yield those parts of a record of declarations that describe symbols."""
     if isinstance(value, dict) and "input" in value:
         yield value
     elif isinstance(value, dict | list):
