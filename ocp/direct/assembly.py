@@ -156,7 +156,7 @@ class Transcription:
         return self.nodes[:, -1]
 
     def duration(self, form: Formulation, variables: np.ndarray, p: np.ndarray) -> float:
-        """Return the horizon (final time), s: the value of its variable, or the fixed one at given parameters."""
+        """Return the horizon (final time), s, from its variable if the horizon is free, else from the parameters."""
         return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

@@ -93,7 +93,7 @@ class ControlStep:
 
     @property
     def violation(self) -> float:
-        """The larger one of the violations of dynamics and limits."""
+        """The larger of the violations of the dynamics and of the limits."""
         return max(self.dynamics_violation, self.limit_violation)
 
     @cached_property
@@ -127,7 +127,7 @@ class Controller:
         self.reset(plan)
 
     def reset(self, plan: Solution) -> None:
-        """Start again from a plan; the next step does not shift it.
+        """Restart the controller from a plan, which the next step does not shift in time.
 
         Raises:
             ProblemError: The plan is not a solution of the prepared problem.
@@ -151,7 +151,7 @@ class Controller:
         self._is_first, self._last = True, dict[str, np.ndarray]()
 
     def step(self, parameters: ByName = None) -> ControlStep:
-        """Solve the problem for new parameters, among them the measured state, from the last step's shifted result.
+        """Solve the problem for new parameters, such as the measured state, from the previous step's shifted result.
 
         Raises:
             ProblemError: A parameter is missing, unknown, of a wrong size or not finite, or a bound is not a number or

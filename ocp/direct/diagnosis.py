@@ -391,7 +391,7 @@ class _Soft:
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
     def conflicts(self, values: np.ndarray, horizon: float, units: np.ndarray) -> list[Conflict]:
-        """Return the violated constraints in decreasing order of violation, each in its own unit."""
+        """Return the violated constraints with violations in the constraints' units, in decreasing order."""
         low, high = self.bounds
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

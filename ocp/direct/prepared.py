@@ -304,7 +304,7 @@ class Prepared:
             raise Interrupted(str(error), first.solution) from error
 
     def is_own_plan(self, guess: Guess) -> bool:
-        """Return whether a guess is a plan of this nonlinear program: same method, mesh, sizes and parameters."""
+        """Return whether a guess is a plan of this nonlinear program: same method, mesh, variables and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)

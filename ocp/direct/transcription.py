@@ -123,7 +123,7 @@ class TranscriptionBuilder:
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Declare that variables of given indices are entries of a state, control or the horizon, and set bounds.
+        """Declare that variables of given indices represent a state, control or the horizon, and set their bounds.
 
         Args:
             role: ``state``, ``control`` or ``horizon``.
