@@ -290,7 +290,7 @@ class _Row(NamedTuple):
     grows: bool = False
 
     def unresolved(self, widths: np.ndarray) -> float:
-        """Return the error beyond its limit, integrated over the horizon; ``widths`` (N,) are those of the intervals.
+        """Return the integral over the horizon of the error beyond its limit; ``widths`` (N,) are the interval widths.
 
         Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
         only once the intervals are narrow enough.

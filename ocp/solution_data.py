@@ -65,7 +65,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivatives of a plan with respect to a parameter of k entries, and the range in which they are valid.
+    """Derivatives of a plan with respect to a parameter of k entries, and the parameter range in which they hold.
 
     Attributes:
         name, value: Name of the parameter, and its value. Shape (k,).
