@@ -72,7 +72,7 @@ def _version() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status.
+    """Run the command `selfmotion` with the given arguments, and return its exit status.
 
     Raises:
         ProblemError: The arguments are not a list of texts.

@@ -169,7 +169,7 @@ def _refine_mesh(
         driven = set()
 
     def assess() -> tuple[list[_Row], list[_Row]]:
-        """Record the errors of the last plan; return all rows, and those beyond their limits."""
+        """Record the errors of the last plan; return all of these errors, and those that exceed their limits."""
         rows = _rows(form, p, solution, audit, tolerance, method)
         intervals.append(method.intervals)
         for kind, values in errors.items():
@@ -290,7 +290,7 @@ class _Row(NamedTuple):
     grows: bool = False
 
     def unresolved(self, widths: np.ndarray) -> float:
-        """Return the error beyond its limit, integrated over the horizon; ``widths`` (N,) are those of the intervals.
+        """Return the integral over the horizon of the error beyond its limit; ``widths`` (N,) are the interval widths.
 
         Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
         only once the intervals are narrow enough.
@@ -313,7 +313,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions scaled to the maximum (or, if summed, to the mean) ``total``. Shape (N,)."""
+        """Return the contributions scaled so that their maximum (their mean if summed) is ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))

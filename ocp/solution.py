@@ -291,7 +291,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan with the problem that was read from its file; raise ProblemError if the two do not match."""
+        """Return the plan with the problem from the same file attached; raise ProblemError if the two do not match."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:

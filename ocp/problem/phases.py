@@ -141,7 +141,7 @@ class Phases(Problem):
             whole.join(before, after)
 
         def at(phase: Phase, expression: Any, begin: bool = False) -> Any:
-            """Return an expression of states and of values at the start, at one end of a phase."""
+            """Return an expression of the original problem, evaluated at the start or the end of a phase."""
             pairs = [(problem.time, phase.begin if begin else phase.begin + phase.duration), (horizon.symbol, total)]
             pairs += [(declared.parameters[name].symbol, own.symbol) for name, own in whole.declared.parameters.items()]
             pairs += [(v.symbol, phase.at_start(n) if begin else phase.at_end(n)) for n, v in declared.states.items()]
@@ -366,9 +366,9 @@ class _PhaseInserter:
 
 
 def _leg(problem: Problem, begin: float, end: float, total: float) -> Problem:
-    """Return a problem of fixed horizon ``total`` between two times (s), without its terminal cost and end constraints.
+    """Return the part of a problem between two times (s), without its terminal cost and its end constraints.
 
-    States are given at the start of the first and at the end of the last leg only.
+    ``total`` is the problem's horizon, s. Only the first part has given start states, only the last given end states.
     """
     leg = copy(problem)
     own = leg.declared

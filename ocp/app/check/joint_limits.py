@@ -407,7 +407,7 @@ def limit_rows(
 
 
 def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
-    """Return the row about the speed of the joints at both ends of a motion; the verdict is OK if they are at rest."""
+    """Return the table row of the largest joint speed at both ends of a motion, with verdict OK if all joints rest."""
     speeds, names = motion.end_speeds(), [robot.joint_names[k] for k in joints]
     units = [robot.joint(name).unit for name in names]
     end, column = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))
