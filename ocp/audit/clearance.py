@@ -399,7 +399,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the start, as a fraction of the horizon, of time intervals, given by index and bisection level."""
+        """Convert index and bisection level of time intervals to their start times as fractions of the horizon."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level

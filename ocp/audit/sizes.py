@@ -46,7 +46,7 @@ class FineGrid:
     p: np.ndarray
 
     def point(self, form: Formulation, at: slice = slice(None)) -> tuple[Any, ...]:
-        """Return samples, and the states and controls at the start, as arguments of :meth:`Formulation.sampled`."""
+        """Return data at the samples `at`, and states and controls at the start, for :meth:`Formulation.sampled`."""
         starts = (form.x0, self.states[0]), (form.u0, self.controls[0])
         return self.states[at], self.controls[at], self.t[at], self.horizon, self.p, *starts
 

@@ -184,7 +184,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _with_approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append the motion to the start of a task to the sequence, if needed; return the plan along the task."""
+        """Append an approach to the start of a task to the sequence, if needed; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -224,9 +224,7 @@ def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the joints at which the next task's plan starts, or the goal itself if these do not satisfy
-    it.
-    """
+    """Return a goal at the joints at which the next task's plan starts; if they miss the goal, return it unchanged."""
     first = plan.at(0.0)
     if goal.region is not None or (
         goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START

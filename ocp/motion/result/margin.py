@@ -369,7 +369,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     rows: list[Requirements] = []
 
     def bounded(values: Array) -> Array:
-        """Return upper bounds of values around the samples, of the same shape (M, ...)."""
+        """Return upper bounds of sampled values (M, ...) in the intervals around the samples."""
         steps = values.reshape(*times.shape, -1)
         bends = np.abs(np.diff(steps, n=2, axis=1)).max(axis=1, keepdims=True)
         return np.asarray((steps + bends).reshape(values.shape))

@@ -396,7 +396,7 @@ class AtlasSearch:
         return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path whose steps each cost at most `max_cost`; return the charts such paths may use, and the path.
+        """Find a path whose steps each cost at most `max_cost`; return charts that may contain one, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
