@@ -343,7 +343,7 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds, m, of two bodies' distance at joint vectors (k, dof), and where balls do not suffice.
+        """Return lower bounds, m, of the distance at joint vectors (k, dof), and a mask where balls do not suffice.
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """

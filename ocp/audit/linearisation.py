@@ -28,7 +28,7 @@ MAX_DERIVATIVES = 3
 
 
 class Limits:
-    """Lower and upper limits of quantities at points of a plan, distances to the limits, and which may be active.
+    """Lower and upper limits of quantities at points of a plan: distances to them, and masks of possibly active limits.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -59,7 +59,7 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: Any) -> Limits:
-        """Return the limits at some of the points of the plan, given by a slice or an array of indices."""
+        """Return the limits at those points of the plan that a slice or an array of indices selects."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
@@ -80,7 +80,7 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """For upper, then lower limits: which may be active (equalities once), the distances, and the sign 1 or -1."""
+        """Mask of possibly active limits (equalities once), distances to them, and sign: upper, then lower limits."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
@@ -296,7 +296,7 @@ class Linearisation:
         self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
-        """Add state equalities as limits of the controls: differentiate them in time until a control appears.
+        """Add limits of the controls that state equalities imply: differentiate these in time until a control appears.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then

@@ -39,7 +39,7 @@ from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTI
 
 
 class _Demand(NamedTuple):
-    """Largest demand on an actuator: its ratio to the limit, the limited quantity, and the reason that states it."""
+    """Largest demand on an actuator: ratio to its limit, limited quantity, and a `Reason` that describes the demand."""
 
     ratio: float = 0.0
     quantity: str = ""
@@ -94,7 +94,7 @@ def _moving_joints(plan: SolvedPlan) -> tuple[Any, Array, tuple[Array, ...]]:
 
 
 def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return which actuator a plan demands most of, relative to its limit; None if no actuator is limited.
+    """Return the reason that describes a plan's largest demand on an actuator, relative to its limit, or None.
 
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.
@@ -111,7 +111,7 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
 
 
 def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> _Demand:
-    """Return the largest demand on joints by values (M, n) of a quantity at M times; of ratio 0 without limits."""
+    """Return the largest demand on joints, relative to limits, by values (M, n) of a quantity; 0 without limits."""
     most_allowed = getattr(bounds, quantity)
     if not np.isfinite(most_allowed).any():
         return _Demand()
@@ -126,8 +126,8 @@ def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointB
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
-    """Return a demand of the tasks on a joint beyond its limit, from the branch of a plan: of acceleration, of jerk, or
-    of torque at rest.
+    """Return the largest demand of tasks beyond a limit (of acceleration, jerk, or torque at rest) of a joint that no
+    self-motion moves, on the branch of a plan; None if no limit is exceeded.
 
     A joint that no self-motion moves at a random configuration is not moved at almost all configurations: the tasks
     determine its motion. Divided differences of its velocity are values of its acceleration and jerk (mean value
@@ -221,8 +221,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
-    """Return the ends of the fastest ramps between rest and a self-motion at the ends of a plan, and their middles, as
-    shares of the horizon. Limited jerks switch there.
+    """Return the times, as fractions of the horizon, of the middles and ends of the fastest ramps between rest and the
+    self-motion at the ends of a plan. Limited jerks switch at these times.
     """
     horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
     rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
@@ -253,7 +253,7 @@ def _null_rows(jacobian: Array) -> Array:
 
 
 def _add_demand(error: SolveError, demand: Reason | None) -> None:
-    """Add to the text of an error what a motion demands of the actuators if it ignores their limits."""
+    """Add to the text of an error the largest demand on an actuator of a motion that ignores the actuator limits."""
     words = "no motion within the actuator limits was found"
     if demand is not None:
         words += f"; without them, {demand.detail}"

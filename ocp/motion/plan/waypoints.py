@@ -300,7 +300,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search for paths over some waypoints; all redundant joints but one are fixed at several values."""
+        """Return the search for paths over chosen waypoints; all redundant joints but one have several fixed values."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}

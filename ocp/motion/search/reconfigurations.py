@@ -297,7 +297,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best paths over all sections and on single ones, by increasing cost, and the cost bound 0."""
+        """Return paths over all sections and on single sections, sorted by cost, and 0 as their lower cost bound."""
         count, through_centers = len(self.samples), list[Array]()
         for value in range(len(self._values)):
             restricted = copy(self)

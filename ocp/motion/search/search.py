@@ -336,7 +336,7 @@ class AtlasSearch:
         return self._branch_and_bound(layers, max_cost, self.path_cost(best_path), best_path)
 
     def lower_bound(self, known_cost: float) -> float:
-        """Return a lower bound of the cost of all paths, at most `known_cost` less the gap that ends the search.
+        """Return a lower bound of the cost of all paths, at most (1 - `gap`) times `known_cost`.
 
         No path is searched. The bound is what time limit and memory allow. `known_cost` is that of a known motion.
         """
@@ -345,7 +345,7 @@ class AtlasSearch:
     def _branch_and_bound(
         self, layers: list[Charts], max_cost: float, best_cost: float, best_path: Array | None
     ) -> tuple[Array | None, float]:
-        """Return the best path, which is improved if one is given, and a lower bound of the cost of all paths."""
+        """Improve the given path, if any, and return it with a lower bound of the cost of all paths."""
         target, bound = 1 - self.gap, 0.0
         coarse = best_path is not None
         remaining = np.zeros(len(self.times) - 1)  # least cost before and after each step
@@ -386,7 +386,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
-        """Return the path cost up to which charts are halved, as memory permits; -inf if splitting must end."""
+        """Return the cost bound below which charts are halved, as high as memory permits; -inf if halving must end."""
         costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
         if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
             return -np.inf
@@ -396,7 +396,7 @@ class AtlasSearch:
         return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path whose steps each cost at most `max_cost`; return the charts such paths may use, and the path.
+        """Find a path whose steps each cost at most `max_cost`; return charts that may contain one, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -419,7 +419,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Shorten the path along the least cost-to-go bound; return None if it breaks off or has too long steps."""
+        """Return a path through charts of least cost-to-go bound, shortened; None if it breaks off or is invalid."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 

@@ -220,7 +220,7 @@ class TaskSearch:
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return bound, time and configuration of the classes of motions without a path whose bound is below `cost`."""
+        """Return cost bound, time and configuration of each class of motions below a `cost` without a known path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
@@ -280,7 +280,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose few sample times of a motion such that straight steps between them cost at most a given fraction less.
+    """Choose few times of a motion so that straight steps between them cost at most the fraction `share` less than it.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

@@ -33,7 +33,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Convert a start, joints or None to (Start, joint positions (n,) or None if free, base configuration).
+        """Convert a start, joint positions or None to a `Start`; also return its joints (n,) or None, and its base.
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -45,7 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a start or joints to (Start, joint positions (n,), base configuration); no joint may be free.
+        """Convert a start or joint positions to a `Start`; also return its joints (n,), all given, and its base.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.

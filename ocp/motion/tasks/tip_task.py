@@ -294,8 +294,8 @@ class BoundTask(NamedTuple):
 
     @property
     def target_rows(self) -> dict[str, tuple[slice, slice]]:
-        """Rows of a pose's targets in the column of targets, and of their velocities (3 rows), by name: "position" (3
-        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), if prescribed.
+        """Rows of the column of targets that contain each prescribed target and, in 3 rows, its velocity, by name:
+        "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows).
         """
         rows, at = dict[str, tuple[slice, slice]](), 0
         for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
