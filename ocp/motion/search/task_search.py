@@ -9,8 +9,8 @@ from typing import Any
 from warnings import warn
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from models import FixedBase, Sphere
 from models.checks import Array
@@ -386,7 +386,8 @@ def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, b
         turn = 0.0 if joint.kind == "prismatic" else 1.0
         levers[:, column] += abs(ratio) * np.array([*(arm if turn else 1.0 for arm in reach), turn])
     places = [poses.positions + poses.rotations @ (axes.T @ (point - tip)) for point in points]
-    turns = Rotation.from_matrix(poses.rotations[:-1]).inv() * Rotation.from_matrix(poses.rotations[1:])
+    attitudes = scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
+    turns = attitudes[:-1].inv() * attitudes[1:]
     lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places]
     with np.errstate(divide="ignore", invalid="ignore"):
         rates = np.where(levers > 0, levers / cost.weights, 0.0)
