@@ -308,7 +308,7 @@ def test_a_robust_plan_that_is_not_found_fails_with_the_error_of_its_planner(mon
         raise DeadEnd("the arm is stuck", name="slider", time=0.4)
 
     monkeypatch.setattr(dispatch, "_plan", refuse)
-    with pytest.raises(DeadEnd, match="no motion covers payload 1: .*the arm is stuck") as caught:
+    with pytest.raises(DeadEnd, match=r"no motion covers payload 1: .*the arm is stuck") as caught:
         fast_swing({"payload": 1.0})
     assert (caught.value.name, caught.value.time) == ("slider", 0.4)
 
