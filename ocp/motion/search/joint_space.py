@@ -52,6 +52,11 @@ class JointSpace:
         delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
         return np.asarray(delta)
 
+    def joint_difference(self, joint: int, to: Array, start: Array) -> Array:
+        """Return the displacements (M,) of one joint; a periodic joint turns by at most half a turn."""
+        delta = to - start
+        return np.asarray(delta - FULL_TURN * np.round(delta / FULL_TURN)) if self.periodic[joint] else delta
+
     def length(self, displacement: Array) -> Array:
         """Return the lengths of joint displacements (..., n) in the metric of the joint space."""
         return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))

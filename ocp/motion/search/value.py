@@ -127,6 +127,7 @@ class ChartGraph:
         radius = min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)
         mean_count = sample.count_neighbors(tree, radius) / sample.n
         batch = max(16, int(self.settings.pairs / max(mean_count, 1.0)))
+        columns = [np.ascontiguousarray(rows.T) for rows in (source.centers, target.centers, *spans)]
         for first in range(0, len(source), batch):
             rows = np.arange(first, min(first + batch, len(source)))
             batch_tree = self.space.tree(source.centers[rows])
@@ -135,9 +136,10 @@ class ChartGraph:
             i, j, distance = rows[pairs["i"]], pairs["j"].astype(np.intp), pairs["v"]
             close = distance <= reach + sizes[0][i] + sizes[1][j]
             i, j = i[close], j[close]
-            delta = np.abs(self.space.difference(target.centers[j], source.centers[i]))
-            close = (delta <= limit + spans[0][i] + spans[1][j]).all(axis=1)
-            i, j = i[close], j[close]
+            for joint, (start, end, start_span, end_span) in enumerate(zip(*columns, strict=True)):
+                delta = np.abs(self.space.joint_difference(joint, end[j], start[i]))
+                close = delta <= limit[joint] + start_span[i] + end_span[j]
+                i, j = i[close], j[close]
             order = np.argsort(i, kind="stable")
             yield i[order], j[order]
 
