@@ -96,18 +96,24 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Quadratic spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients."""
+    """Spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients.
 
-    def __init__(self, nodes: Array) -> None:
-        self.nodes, self.h = nodes, np.diff(nodes)
-        before, after = np.append(0.0, self.h), np.append(self.h, 0.0)
-        self.width = before + after
-        self.share = before / self.width
+    In an interval the acceleration is linear in the time of a motion whose speed is linear in time, from `ratios` times
+    its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With ratios of 1 it is
+    a spline of degree 2. The coefficients are the values where the tangents at neighbouring nodes meet.
+    """
+
+    def __init__(self, nodes: Array, ratios: Array) -> None:
+        self.nodes, self.h, self.ratios = nodes, np.diff(nodes), ratios
+        mean = (4 - ratios) / 6
+        before, after = np.append(0.0, mean * self.h), np.append((1 - mean) * self.h, 0.0)
+        self.width = 2 * (before + after)
+        self.share = 2 * before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
         """Return a spline whose consecutive coefficients are those of this spline at the given indices `at`."""
         part, last = copy(self), len(self.h)
-        part.h = self.h[np.minimum(at[:-2], last - 1)]
+        part.h, part.ratios = (kind[np.minimum(at[:-2], last - 1)] for kind in (self.h, self.ratios))
         nodes = np.minimum(at[:-1], last)
         part.nodes, part.width, part.share = self.nodes[nodes], self.width[nodes], self.share[nodes]
         return part
@@ -123,13 +129,12 @@ class Spline:
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
         """Return matrices from 3 coefficients to squared speed and its 2 derivatives at M points. Shape (3, 3, M)."""
-        h, share = self.h[interval], self.share[interval]
-        inside = fraction * h
+        h, share, ratio = self.h[interval], self.share[interval], self.ratios[interval]
+        time = 2 * fraction / (ratio + np.sqrt(ratio**2 + 4 * (1 - ratio) * fraction))  # fraction of the time
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
-        second = np.array([first / h, -(first + last) / h, last / h])
-        slope_at_start = np.array([-first, first, 0 * h])
-        slope = slope_at_start + inside * second
-        value = inside / 2 * (slope_at_start + slope)
+        start, change = np.array([-first, first, 0 * h]), np.array([first, -(first + last), last])
+        slope, second = start + change * time, change / (h * (ratio + 2 * (1 - ratio) * time))
+        value = h * (start * fraction + change * (fraction * time - time**2 * (ratio / 2 + (1 - ratio) * time / 3)))
         value[0] += 1 - share
         value[1] += share
         return np.array([value, slope, second])
@@ -184,9 +189,9 @@ class _EndConditions:
     """End conditions of a spline of the squared speed: fixed coefficients or, at rest, a ratio of the outermost two."""
 
     def __init__(self, program: Program) -> None:
-        n, h, (first, last) = len(program.upper), program.spline.h, program.rest
-        self.sides = [(0, 1, 1 / (1 + 2 * h[0] / (3 * first)))] if first else []
-        self.sides += [(n - 1, n - 2, 1 / (1 + 2 * h[-1] / (3 * last)))] if last else []
+        n, width, (first, last) = len(program.upper), program.spline.width, program.rest
+        self.sides = [(0, 1, 1 / (1 + 2 * width[0] / (3 * first)))] if first else []
+        self.sides += [(n - 1, n - 2, 1 / (1 + 2 * width[-1] / (3 * last)))] if last else []
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
     def impose(self, b: Array) -> Array:
@@ -271,10 +276,11 @@ class _Constraints:
         self.interval = np.concatenate([np.arange(self.count), np.clip(self.bounded - 1, 0, self.count - 1), interval])
         self.bound = np.concatenate([np.zeros(self.count), upper[self.bounded], rows.bound[order]])
         basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
-        self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
+        at_root = spline.basis(interval, rows.root[order])
+        self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * at_root[2]
         self.gradients = self.linear.copy()
         self.jerk = int(len(order) - rows.jerk.sum())  # first jerk limit
-        self.square = spline.basis(interval[self.jerk :], rows.root[order[self.jerk :]])[0]
+        self.square = at_root[0][:, self.jerk :]
         self.sharp = self.bound[self.alone + self.jerk :].copy()
         self.bound[self.alone + self.jerk :] = 0.0
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))

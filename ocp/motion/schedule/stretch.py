@@ -125,6 +125,7 @@ def _solve_window(
             margin[: len(previous)] = previous
         enforced.mask[:, :, : before.mask.shape[2]] = before.mask
         enforced.speeds[:, : before.mask.shape[2]] = before.speeds
+        enforced.ratios[: before.mask.shape[2]] = before.ratios
         enforced.inherited = before.mask.shape[2]
     to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tighten(window, enforced, seam, checked)
@@ -305,7 +306,11 @@ def _solve_with_jerk(
             caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
     inner = slice(low, high)
     cells = slice(low, high - 1)
-    spline = Spline(nodes[inner])
+    if known is not None and len(free) == end - begin:
+        v = np.sqrt(known[0])
+        new = slice(enforced.inherited, None)
+        enforced.ratios[new] = (2 * v[:-1] / (v[:-1] + v[1:]))[new]
+    spline = Spline(nodes[inner], enforced.ratios[cells])
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
     upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
@@ -322,7 +327,7 @@ def _solve_with_jerk(
         new = free[(free >= max(low, enforced.inherited)) & (free < high - 1)]
         enforced.speeds[:, new] = _speed_ratios(spline, b)[:, new - low]
     fixed: list[int] = []
-    sides = ((0, 1, spline.h[0]), (len(b) - 1, len(b) - 2, -spline.h[-1]))
+    sides = ((0, 1, spline.width[0]), (len(b) - 1, len(b) - 2, -spline.width[-1]))
     for (x_end, slope_end), resting, (outermost, next_to, signed_width) in zip(ends, at_rest, sides, strict=True):
         if not resting:
             b[outermost], b[next_to] = x_end, x_end + signed_width * slope_end / 2
@@ -453,12 +458,12 @@ def _jerk_place(inside: float) -> float:
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
     """Return the speeds at the points where limits are enforced over those at the points of `_jerk_place`."""
-    x, slope = spline.at_nodes(b)
-    second = np.diff(slope) / spline.h
+    every, (x, _) = np.arange(len(spline.h)), spline.at_nodes(b)
 
     def at(inside: float) -> Array:
-        distance = inside * spline.h
-        return np.asarray(np.maximum(x[:-1] + distance * (slope[:-1] + distance * second / 2), SETTINGS.dive * x[:-1]))
+        value = spline.basis(every, np.full(len(every), inside))[0]
+        squares = value[0] * b[:-2] + value[1] * b[1:-1] + value[2] * b[2:]
+        return np.asarray(np.maximum(squares, SETTINGS.dive * x[:-1]))
 
     places = [(0.0, *INSIDE, 1.0)[k] for k in ENFORCED_AT]
     return np.sqrt([at(inside) / at(_jerk_place(inside)) for inside in places])

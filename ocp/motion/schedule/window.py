@@ -157,6 +157,7 @@ class EnforcedRows:
         mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
         speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
+        ratios: Speed where each interval begins over its mean there, see `Spline`. Shape (N,).
         inherited: Number of intervals taken over from the previous window.
     """
 
@@ -164,6 +165,7 @@ class EnforcedRows:
     times: Margins
     mask: NDArray[np.bool_]
     speeds: Array
+    ratios: Array
     inherited: int = 0
 
     @classmethod
@@ -173,12 +175,13 @@ class EnforcedRows:
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
         mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)))
+        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)), np.ones(count))
 
     def after(self, first: int) -> EnforcedRows:
         """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
         part = slice(first, None)
-        return EnforcedRows(self.margins.take(part), self.times.take(part), self.mask[:, :, part], self.speeds[:, part])
+        margins, times = self.margins.take(part), self.times.take(part)
+        return EnforcedRows(margins, times, self.mask[:, :, part], self.speeds[:, part], self.ratios[part])
 
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
