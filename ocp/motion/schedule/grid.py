@@ -125,6 +125,14 @@ class Grid:
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
         return rows.take(slice(count)), rows.take(right)
 
+    def split(self, parts: NDArray[np.intp]) -> Grid:
+        """Return a grid with each interval split into a number of equal parts (N,)."""
+        ends, at = np.cumsum(parts), np.repeat(np.arange(len(parts)), parts)
+        inside = (np.arange(ends[-1]) - np.repeat(ends - parts, parts)) / parts[at]
+        s = np.append(self.distance[at] + inside * np.diff(self.distance)[at], self.distance[-1])
+        jumps = ends[self.jumps - 1]
+        return Grid(self.path, self.limits, self.joints, s, self.requested[at], jumps, self.before, self.sharp)
+
     def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]

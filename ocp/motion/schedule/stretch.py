@@ -69,6 +69,7 @@ class StretchSettings:
 
     rounds: int = 20
     unused: float = 1e-4
+    unused_jerk: float = 1e-5
     exceeded: float = 5e-4
     parts: int = 8
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
@@ -121,27 +122,27 @@ def _solve_window(
     """
     enforced = EnforcedRows.build(window)
     if before is not None:
+        enforced.inherited = part = len(before.ratios)
         for margin, previous in zip(enforced.margins, before.margins, strict=True):
-            margin[: len(previous)] = previous
-        enforced.mask[:, :, : before.mask.shape[2]] = before.mask
-        enforced.speeds[:, : before.mask.shape[2]] = before.speeds
-        enforced.ratios[: before.mask.shape[2]] = before.ratios
-        enforced.inherited = before.mask.shape[2]
-    to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
-    x, slope = _tighten(window, enforced, seam, checked)
+            margin[:part] = previous
+        enforced.mask[:, :, :part], enforced.speeds[:, :part] = before.mask, before.speeds
+        enforced.ratios[:part] = before.ratios
+    x, slope, window, enforced, seam = _tighten(window, enforced, seam)
+    to_seam = seam - window.first
     state = float(x[to_seam]), float(slope[to_seam])
-    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.after(to_seam)
+    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.take(slice(to_seam, None))
 
 
-def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> Motion:
+def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, Array, Window, EnforcedRows, int]:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
-    first `checked` intervals must keep the limits.
+    The second motion shows the intervals to split. If few intervals still violate limits, these are planned again with
+    their neighbours, between fixed motions. The first intervals beyond the seam must keep the limits as well.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
     for number in range(SETTINGS.rounds):
+        checked = min(seam + SETTINGS.overlap // 2, window.last) - window.first
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
             x, slope = _solve_with_jerk(window, enforced, seam, start, accuracy, free)
@@ -150,26 +151,46 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
                 raise
             free = every  # too short for the change of motion
             continue
-        used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None)
+        profile = motion_profile(window, x, slope)
+        used, values = limit_usage(window, profile, free, start is not None)
         used /= _seam_shares(window, seam)[:, None]
-        if start is None:
+        start = x, slope
+        if number == 0:
             enforced.enforce_near(used, values, window.rows[1].jerk[:, :, 0])
-            start = x, slope
             continue
         violated = used > 1 + ROUNDING_SHARE
         affected = np.asarray(violated.any(axis=(0, 2)))
         if not affected[:checked].any() and accuracy == accuracies[-1]:
-            return x, slope
+            return x, slope, window, enforced, seam
         if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
         enforced.lower(used, enforced.enforce(violated, values), window.rows[0], seam - window.first)
-        start = x, slope
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
+        if number == 1:
+            parts = _switching_parts(window, enforced, seam, profile, values)
+            grid, added = window.grid, int(parts.sum()) - len(parts)
+            grid = grid.split(np.pad(parts, (window.first, len(grid.requested) - window.last), constant_values=1))
+            window = Window.build(Stretch(grid, 0, 0), window.first, window.last + added, window.ends)
+            enforced, seam, every = enforced.take(np.repeat(every, parts)), seam + added, np.arange(parts.sum())
+            motion, free = profile.at_distance(window.nodes), every
+            start = motion.speed**2, 2 * motion.acceleration
     worst = used[:, :checked].max(axis=(0, 2))
     place, largest = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
+
+
+def _switching_parts(
+    window: Window, enforced: EnforcedRows, seam: int, profile: SpeedProfile, values: Array
+) -> NDArray[np.intp]:
+    """Return into how many parts to split the intervals in which a motion uses no limit, as where its jerk switches."""
+    requested = window.grid.requested[window.first : window.last]
+    speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
+    unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0) * np.diff(profile.t[::2])
+    parts = np.clip(np.ceil(unused / (SETTINGS.unused_jerk * profile.duration)), 1, SETTINGS.parts).astype(np.intp)
+    parts[: enforced.inherited] = parts[seam - window.first :] = 1
+    return parts
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
@@ -307,9 +328,8 @@ def _solve_with_jerk(
     inner = slice(low, high)
     cells = slice(low, high - 1)
     if known is not None and len(free) == end - begin:
-        v = np.sqrt(known[0])
-        new = slice(enforced.inherited, None)
-        enforced.ratios[new] = (2 * v[:-1] / (v[:-1] + v[1:]))[new]
+        v, new = np.sqrt(known[0]), slice(max(low, enforced.inherited), high - 1)
+        enforced.ratios[new] = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), 0.5, 1.5)[new]  # the speed grows threefold at most
     spline = Spline(nodes[inner], enforced.ratios[cells])
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0

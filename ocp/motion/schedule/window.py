@@ -138,8 +138,8 @@ class Margins(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def take(self, part: slice) -> Margins:
-        """Return the usable fractions of the limits in some intervals, as views of the same memory."""
+    def take(self, part: slice | NDArray[np.intp]) -> Margins:
+        """Return the usable fractions of the limits in some intervals, as views of the same memory for a slice."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
@@ -177,11 +177,11 @@ class EnforcedRows:
         mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
         return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)), np.ones(count))
 
-    def after(self, first: int) -> EnforcedRows:
-        """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
-        part = slice(first, None)
+    def take(self, part: slice | NDArray[np.intp]) -> EnforcedRows:
+        """Return the enforced limits in some intervals, as views of the same memory for a slice."""
         margins, times = self.margins.take(part), self.times.take(part)
-        return EnforcedRows(margins, times, self.mask[:, :, part], self.speeds[:, part], self.ratios[part])
+        mask, speeds, ratios = self.mask[:, :, part], self.speeds[:, part], self.ratios[part]
+        return EnforcedRows(margins, times, mask, speeds, ratios, self.inherited)
 
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.

@@ -32,7 +32,7 @@ def random_rows(seed: int, count: int) -> tuple[Program, _Constraints, np.ndarra
         jerk,
     )
     most = np.where(rng.uniform(size=count + 2) < 0.5, 5.0, np.inf)
-    spline = Spline(np.cumsum(rng.uniform(0.1, 1.0, count + 1)))
+    spline = Spline(np.cumsum(rng.uniform(0.1, 1.0, count + 1)), rng.uniform(0.5, 1.5, count))
     program = Program(spline, rows, most, (0.0, 0.0), np.arange(0))
     return program, _Constraints(program), rng.uniform(0.5, 2.0, count + 2)
 
@@ -54,8 +54,8 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
     assert (every.evaluate(b + step)[0] - every.evaluate(b - step)[0]) / 2 == pytest.approx(change, abs=1e-10)
 
     rows, near = program.rows, np.stack([b[program.rows.interval + k] for k in range(3)])
-    x, slope, bend = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
-    root = (program.spline.basis(rows.interval, rows.root)[0] * near).sum(axis=0)
+    x, slope, _ = (program.spline.basis(rows.interval, rows.fraction) * near).sum(axis=1)
+    root, _, bend = (program.spline.basis(rows.interval, rows.root) * near).sum(axis=1)
     bound = rows.bound * np.where(rows.jerk, root**-0.5, 1.0)
     missed = [(rows.of * np.stack([x, slope, bend], axis=1)).sum(axis=1) - bound, -b[1:-1], b - program.upper]
     every.evaluate(b)
@@ -85,23 +85,34 @@ def test_a_spline_has_the_values_and_derivatives_of_its_basis(seed: int) -> None
     """And goes through what it is made of; its second derivative is that of the slopes."""
     rng = np.random.default_rng(seed)
     nodes = np.cumsum(rng.uniform(0.1, 1.0, 9))
-    spline = Spline(nodes)
+    spline = Spline(nodes, rng.uniform(0.5, 1.5, len(nodes) - 1))
     b = rng.uniform(0.5, 2.0, len(nodes) + 1)
     x, slope = spline.at_nodes(b)
     assert spline.through(x, slope) == pytest.approx(b)
     interval, fraction = rng.integers(0, 8, 30), rng.uniform(0, 1, 30)
     near = np.stack([b[interval + k] for k in range(3)])
     value, first, second = (spline.basis(interval, fraction) * near).sum(axis=1)
-    path = fraction * np.diff(nodes)[interval]
-    assert second == pytest.approx((np.diff(slope) / np.diff(nodes))[interval])
-    assert first == pytest.approx(slope[interval] + path * second)
-    assert value == pytest.approx(x[interval] + path * (slope[interval] + first) / 2)
+    # the slope is linear in the time of a motion with a speed that is linear in time
+    r, width = spline.ratios[interval], np.diff(nodes)[interval]
+    time = np.linspace(0.0, 1.0, 2001)[:, None]
+    time = np.array([np.interp(f, part, time[:, 0]) for f, part in zip(fraction, (r * time + (1 - r) * time**2).T)])
+    assert first == pytest.approx(slope[interval] + time * np.diff(slope)[interval], rel=1e-5, abs=1e-5)
+    step = 1e-5
+    ahead, behind = (
+        (spline.basis(interval, np.clip(fraction + side, 0, 1)) * near).sum(axis=1) for side in (step, -step)
+    )
+    inside = (fraction > step) & (fraction < 1 - step)
+    for k, derivative in enumerate((first, second)):
+        assert ((ahead[k] - behind[k]) / (2 * step * width))[inside] == pytest.approx(derivative[inside], rel=1e-5, abs=1e-5)
+    ends = (spline.basis(np.arange(8), np.full(8, end)) * np.stack([b[k : k + 8] for k in range(3)]) for end in (0.0, 1.0))
+    for end, (value, first, _) in enumerate(part.sum(axis=1) for part in ends):
+        assert value == pytest.approx(x[end : end + 8]) and first == pytest.approx(slope[end : end + 8])
 
 
 def from_rest_to_rest(seed: int, count: int) -> Program:
     """Speeds, accelerations and jerks that vary along a path."""
     rng = np.random.default_rng(seed)
-    spline = Spline(np.cumsum(rng.uniform(0.5, 1.5, count + 1)) / count)
+    spline = Spline(np.cumsum(rng.uniform(0.5, 1.5, count + 1)) / count, rng.uniform(0.5, 1.5, count))
     wave = 1 + 0.5 * np.sin(np.arange(count) * rng.uniform(0.05, 0.3))
     interval, sign = np.repeat(np.arange(count), 4), np.tile([1.0, -1.0, 0.0, 0.0], count)
     bend = np.tile([0.0, 0.0, 1.0, -1.0], count)
