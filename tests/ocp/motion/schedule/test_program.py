@@ -165,10 +165,12 @@ def test_demands_equal_those_of_dense_samples() -> None:
     """In every interval, by every limit that comes near: no less; and next to no more where that would matter."""
     path, joints = panda_path(4)
     limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)
-    grid = make_grid(path, limits, joints)
+    grid, plan = make_grid(path, limits, joints), schedule(path, limits, joints=joints)
+    # the nodes of the plan, which splits intervals of the grid
+    at = np.searchsorted(plan.profile.distance, grid.distance * (1 - 1e-12))
+    grid = grid.split(np.maximum(np.diff(at) // 2, 1))
     stretch, every = Stretch(grid, 0, len(grid.requested)), np.arange(len(grid.requested))
     window = Window.build(stretch, 0, len(grid.requested), stretch.ends)
-    plan = schedule(path, limits, joints=joints)
     motion = plan.profile.at_distance(grid.distance)
     profile = motion_profile(window, motion.speed**2, 2 * motion.acceleration)
     used, values = limit_usage(window, profile, every)
