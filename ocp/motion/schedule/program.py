@@ -11,9 +11,9 @@ are linear in (x, x', x'') except for x^(-1/2), which is convex: the time is a c
 <= convex, whose tangent is conservative (Debrouwere et al., Time-Optimal Path Following for Robots With Convex-Concave
 Constraints, 2013). Each step of the primal-dual interior point updates the tangents.
 
-x is a spline of degree 2 with a knot at every node: x'' is constant in an interval. Its B-spline coefficients are the
-unknowns; a row involves three of them and the normal equations have five diagonals, so a step costs time and memory in
-proportion to the nodes.
+x is a spline with a knot at every node; in an interval x'' is proportional to the reciprocal of a speed that is known
+in advance. Its coefficients are the unknowns; a row involves three of them and the normal equations have five
+diagonals, so a step costs time and memory in proportion to the nodes.
 
 Motions at distant places are almost independent. Therefore each interval has its own step length, which varies slowly
 along the path; the number of steps then hardly grows with the nodes. If such steps diverge from the bounds, all
@@ -81,7 +81,6 @@ class SplineRows(NamedTuple):
     Attributes:
         interval: Interval in which each row holds. Shape (M,).
         fraction: Position in the interval at which it holds, in [0, 1]. Shape (M,).
-        root: Position in the interval of the x of x^(-1/2). Shape (M,).
         of: Coefficients c in c . (x, x', x'') <= bound for squared speed x. Shape (M, 3).
         bound: Upper bound of each row. Shape (M,).
         jerk: Whether the row is a limit of jerk, c . (x, x', x'') <= bound x^(-1/2). Shape (M,).
@@ -89,7 +88,6 @@ class SplineRows(NamedTuple):
 
     interval: NDArray[np.intp]
     fraction: Array
-    root: Array
     of: Array
     bound: Array
     jerk: NDArray[np.bool_]
@@ -99,8 +97,8 @@ class Spline:
     """Spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients.
 
     In an interval the acceleration is linear in the time of a motion whose speed is linear in time, from `ratios` times
-    its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With ratios of 1 it is
-    a spline of degree 2. The coefficients are the values where the tangents at neighbouring nodes meet.
+    its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With ratios of 1 this
+    is a spline of degree 2. The coefficients are the values where the tangents at neighbouring nodes meet.
     """
 
     def __init__(self, nodes: Array, ratios: Array) -> None:
@@ -276,11 +274,10 @@ class _Constraints:
         self.interval = np.concatenate([np.arange(self.count), np.clip(self.bounded - 1, 0, self.count - 1), interval])
         self.bound = np.concatenate([np.zeros(self.count), upper[self.bounded], rows.bound[order]])
         basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
-        at_root = spline.basis(interval, rows.root[order])
-        self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * at_root[2]
+        self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
         self.gradients = self.linear.copy()
         self.jerk = int(len(order) - rows.jerk.sum())  # first jerk limit
-        self.square = at_root[0][:, self.jerk :]
+        self.square = basis[0][:, self.jerk :]
         self.sharp = self.bound[self.alone + self.jerk :].copy()
         self.bound[self.alone + self.jerk :] = 0.0
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))

@@ -63,8 +63,8 @@ class StretchSettings:
         start, again: Initial squared speed over that of a fastest steady motion with bounded acceleration, and over
             that of the solution of a similar program.
         again_inside: Further factor if that start fails.
+        ratios: Least and greatest ratio of the speed where an interval begins to its mean, for rough motions.
         center, center_again: Initial complementarity over the time for these starts.
-        dive: Least squared speed inside an interval over that at its beginning, for rough splines.
     """
 
     rounds: int = 20
@@ -81,9 +81,9 @@ class StretchSettings:
     start: float = 0.5
     again: float = 0.9
     again_inside: float = 0.3
+    ratios: tuple[float, float] = (0.5, 1.5)
     center: float = 1.0
     center_again: float = 0.1
-    dive: float = 0.01
 
 
 SETTINGS = StretchSettings()
@@ -105,39 +105,26 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         seam = end if last else end - SETTINGS.overlap
         goal = stretch.ends[1] if last else (0.0, 0.0)
         window = Window.build(stretch, begin, end, (state, goal))
-        part, state, behind = _solve_window(window, seam, behind)
-        parts.append(part)
+        enforced = EnforcedRows.build(window)
+        if behind is not None:
+            enforced.inherited = part = len(behind.ratios)
+            for margin, previous in zip(enforced.margins, behind.margins, strict=True):
+                margin[:part] = previous
+            enforced.mask[:, :, :part], enforced.ratios[:part] = behind.mask, behind.ratios
+        x, slope, window, enforced, moved_seam = _tighten(window, enforced, seam)
+        at = moved_seam - begin
+        parts.append(motion_profile(window, x[: at + 1], slope))
         if last:
             return join_profiles(parts)
-        begin = seam
-
-
-def _solve_window(
-    window: Window, seam: int, before: EnforcedRows | None
-) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the fastest motion in a window (intervals of a path solved at once), up to the start of the next window.
-
-    Also return the squared speed and its slope at that node, `seam`, and the limits enforced beyond it; `before` are
-    those that the previous window enforced beyond its own seam.
-    """
-    enforced = EnforcedRows.build(window)
-    if before is not None:
-        enforced.inherited = part = len(before.ratios)
-        for margin, previous in zip(enforced.margins, before.margins, strict=True):
-            margin[:part] = previous
-        enforced.mask[:, :, :part], enforced.speeds[:, :part] = before.mask, before.speeds
-        enforced.ratios[:part] = before.ratios
-    x, slope, window, enforced, seam = _tighten(window, enforced, seam)
-    to_seam = seam - window.first
-    state = float(x[to_seam]), float(slope[to_seam])
-    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.take(slice(to_seam, None))
+        begin, state, behind = seam, (float(x[at]), float(slope[at])), enforced.take(slice(at, None))
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, Array, Window, EnforcedRows, int]:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    The second motion shows the intervals to split. If few intervals still violate limits, these are planned again with
-    their neighbours, between fixed motions. The first intervals beyond the seam must keep the limits as well.
+    The second motion shows the intervals to split; the window, its limits and the seam are returned as they then are.
+    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
+    first intervals beyond the seam must keep the limits as well.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
@@ -329,7 +316,8 @@ def _solve_with_jerk(
     cells = slice(low, high - 1)
     if known is not None and len(free) == end - begin:
         v, new = np.sqrt(known[0]), slice(max(low, enforced.inherited), high - 1)
-        enforced.ratios[new] = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), 0.5, 1.5)[new]  # the speed grows threefold at most
+        ratios = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), *SETTINGS.ratios)
+        enforced.ratios[new] = ratios[new]
     spline = Spline(nodes[inner], enforced.ratios[cells])
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
@@ -343,9 +331,6 @@ def _solve_with_jerk(
     else:
         b = spline.through(known[0][inner], known[1][inner])
         b = np.maximum(b, 1e-9 * b.max())
-        # fixed and inherited intervals keep their speed ratios
-        new = free[(free >= max(low, enforced.inherited)) & (free < high - 1)]
-        enforced.speeds[:, new] = _speed_ratios(spline, b)[:, new - low]
     fixed: list[int] = []
     sides = ((0, 1, spline.width[0]), (len(b) - 1, len(b) - 2, -spline.width[-1]))
     for (x_end, slope_end), resting, (outermost, next_to, signed_width) in zip(ends, at_rest, sides, strict=True):
@@ -358,9 +343,7 @@ def _solve_with_jerk(
     places = tuple(rows.take(cells) for rows in window.rows)
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
-    rows = _spline_rows(
-        places, mask[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
-    )
+    rows = _spline_rows(places, mask[:, :, cells], caps[inner], implied, own_shares, in_motion)
     program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
         if known is None:
@@ -425,7 +408,6 @@ def _spline_rows(
     caps: Array,
     implied: Array,
     shares: Margins,
-    speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
     """Return the enforced limits as constraints on the spline of the squared speed along a path.
@@ -435,7 +417,6 @@ def _spline_rows(
         mask: Which of them are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the limits that each interval may use.
-        speeds: Speed ratios at the `ENFORCED_AT` positions, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -447,7 +428,7 @@ def _spline_rows(
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speed_rows(slow, np.full(len(slow), inside), most))
-    for which, at_place, speed in zip(mask, ENFORCED_AT, speeds, strict=True):
+    for which, at_place in zip(mask, ENFORCED_AT, strict=True):
         inside, rows, active = (0.0, *INSIDE, 1.0)[at_place], places[at_place], which[:, :, first:second].copy()
         if inside in (0.0, 1.0) and in_motion[int(inside)]:
             active[:, -int(inside)] = False
@@ -456,43 +437,19 @@ def _spline_rows(
         direction, place = 1.0 - 2.0 * sign, np.full(len(at), inside)
         of = direction[:, None] * np.stack([q, p / 2, np.zeros(len(at))], axis=1)
         bound, is_jerk = shares.acceleration[at, row] - direction * r, np.zeros(len(at), dtype=bool)
-        parts.append(SplineRows(at, place, place, of, bound, is_jerk))
+        parts.append(SplineRows(at, place, of, bound, is_jerk))
         sign, at, row = np.nonzero(which[:, :, second:])
         p, q, r = rows.jerk[at, row].T
-        of = (1.0 - 2.0 * sign)[:, None] * np.stack([speed[at] * r, speed[at] * q / 2, p / 2], axis=1)
-        root = np.full(len(at), _jerk_place(inside))
+        of = (1.0 - 2.0 * sign)[:, None] * np.stack([r, q / 2, p / 2], axis=1)
         place, is_jerk = np.full(len(at), inside), np.ones(len(at), dtype=bool)
-        parts.append(SplineRows(at, place, root, of, shares.jerk[at, row], is_jerk))
+        parts.append(SplineRows(at, place, of, shares.jerk[at, row], is_jerk))
     return SplineRows(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
-
-
-def _jerk_place(inside: float) -> float:
-    """Return the fraction of an interval at which a spline's jerk equals the constant jerk of the motion in that half.
-
-    With squared speed x, the spline's jerk is x''/2 v. With a = a0 + x''/2 (s - s0), two jerks over half the time T
-    each lead to the speed and acceleration at its end if they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6),
-    up to terms of second order.
-    """
-    return 1 / 6 if inside < 0.5 else 5 / 6
-
-
-def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the speeds at the points where limits are enforced over those at the points of `_jerk_place`."""
-    every, (x, _) = np.arange(len(spline.h)), spline.at_nodes(b)
-
-    def at(inside: float) -> Array:
-        value = spline.basis(every, np.full(len(every), inside))[0]
-        squares = value[0] * b[:-2] + value[1] * b[1:-1] + value[2] * b[2:]
-        return np.asarray(np.maximum(squares, SETTINGS.dive * x[:-1]))
-
-    places = [(0.0, *INSIDE, 1.0)[k] for k in ENFORCED_AT]
-    return np.sqrt([at(inside) / at(_jerk_place(inside)) for inside in places])
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
     """Return constraints `of` times squared speed <= 1 at given points, each a fraction of an interval."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
-    return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
+    return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:

@@ -156,7 +156,6 @@ class EnforcedRows:
         times: Number of reductions of each margin.
         mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
-        speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
         ratios: Speed where each interval begins over its mean there, see `Spline`. Shape (N,).
         inherited: Number of intervals taken over from the previous window.
     """
@@ -164,7 +163,6 @@ class EnforcedRows:
     margins: Margins
     times: Margins
     mask: NDArray[np.bool_]
-    speeds: Array
     ratios: Array
     inherited: int = 0
 
@@ -175,13 +173,12 @@ class EnforcedRows:
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
         mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)), np.ones(count))
+        return cls(margins, times, mask, np.ones(count))
 
     def take(self, part: slice | NDArray[np.intp]) -> EnforcedRows:
         """Return the enforced limits in some intervals, as views of the same memory for a slice."""
         margins, times = self.margins.take(part), self.times.take(part)
-        mask, speeds, ratios = self.mask[:, :, part], self.speeds[:, part], self.ratios[part]
-        return EnforcedRows(margins, times, mask, speeds, ratios, self.inherited)
+        return EnforcedRows(margins, times, self.mask[:, :, part], self.ratios[part], self.inherited)
 
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
