@@ -175,9 +175,9 @@ def _switching_parts(
     requested = window.grid.requested[window.first : window.last]
     speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
     unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0) * np.diff(profile.t[::2])
-    parts = np.clip(np.ceil(unused / (SETTINGS.unused_jerk * profile.duration)), 1, SETTINGS.parts).astype(np.intp)
+    parts = np.clip(np.ceil(unused / (SETTINGS.unused_jerk * profile.duration)), 1, SETTINGS.parts)
     parts[: enforced.inherited] = parts[seam - window.first :] = 1
-    return parts
+    return np.asarray(parts, dtype=np.intp)
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
