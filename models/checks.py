@@ -56,7 +56,7 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return numbers, an array or a nested list as a new array of floats; raise one of NOT_NUMBERS for anything else.
+    """Return numbers, an array or a nested list as a float array; raise an error from NOT_NUMBERS for other values.
 
     Values that NumPy would convert are refused too: text, True, None, symbols (read as nan) and complex numbers.
     """
@@ -278,7 +278,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a rotation matrix, (3, 3), after checking that it is one, without rounding errors."""
+        """Return a rotation matrix, (3, 3), after checking that it is one and removing rounding errors."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost

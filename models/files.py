@@ -38,7 +38,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Largest accepted sizes of input, several times those of the largest known files."""
+    """Largest accepted sizes of files and other input, several times the sizes of the largest known files."""
 
     count: int = 1_000_000  # any number that a user chooses, such as a number of nodes
     array_entries: int = 2**22  # entries of one array
@@ -65,7 +65,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: no regular file, too large, or one that other users own or may change."""
+    """Error about a file that is not read: it is not regular, is too large, or other users own or may change it."""
 
     value: int | None = None  # size of a file that is too large, bytes; else None
     limit: int | None = None  # largest size that is read, bytes; else None
@@ -223,7 +223,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key, a SHA-256 digest, of a result of a version of the code from given arrays and strings."""
+    """Return the cache key, a SHA-256 digest, of a result that a code version computes from arrays and strings."""
     digest = hashlib.sha256(version.encode())
     for content in contents:
         data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
@@ -354,15 +354,15 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 
 @contextmanager
-def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
+def exclusive(key: str, poll: Callable[[], Any] = lambda: None) -> Iterator[None]:
     """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
 
-    If the lock file cannot be created, the block runs without a lock. `ask` is called every 20 ms while waiting; it may
-    raise to stop waiting.
+    If the lock file cannot be created, the block runs without a lock. `poll` is called every 20 ms while waiting and
+    may raise to stop waiting.
     """
     lock = None
     with suppress(*UNREADABLE):
-        lock = _open_locked(private_folder(make=True) / f"{key}.lock", ask)
+        lock = _open_locked(private_folder(make=True) / f"{key}.lock", poll)
     try:
         yield
     finally:
@@ -372,7 +372,7 @@ def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]
                 fcntl.flock(lock, fcntl.LOCK_UN)  # else a process forked meanwhile would keep the lock
 
 
-def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
+def _open_locked(file: Path, poll: Callable[[], Any]) -> IO[bytes]:
     """Open a lock file, creating it if necessary, and wait until this process holds the lock."""
     while True:
         stream = open(file, "ab")  # noqa: SIM115
@@ -386,7 +386,7 @@ def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
             stream.close()
             raise
         stream.close()
-        ask()
+        poll()
         time.sleep(0.02)
 
 

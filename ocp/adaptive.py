@@ -37,14 +37,14 @@ FIRST_STARTS = ("guess", "displaced guess")
 
 @dataclass(frozen=True)
 class AdaptiveCollocation:
-    """Collocation on a mesh that is chosen and refined until the cost is known; the method of ``solve(problem)``.
+    """Collocation on a mesh that is refined until the cost is accurate enough; the method of ``solve(problem)``.
 
     Attributes:
         accuracy: Accuracy of the cost: largest relative cost that the controls may lose, and largest relative
             integration error.
         max_intervals: Maximum number of intervals.
         progress: As of :func:`ocp.motion.plan.plan`: a function that is called with the name of each stage, True for a
-            line on the terminal, False for nothing; None shows the line after two seconds.
+            line on the terminal, False for no report; None shows the line after two seconds.
 
     Raises:
         ProblemError: accuracy is not between 0 and 1, or max_intervals is smaller than that of the finest
@@ -83,7 +83,7 @@ def default_method() -> AdaptiveCollocation:
 
 
 class AdaptiveProblem:
-    """A problem that adaptive collocation solves, on as many meshes as it takes."""
+    """A problem that adaptive collocation solves, on as many meshes as necessary."""
 
     def __init__(
         self, problem: Problem, method: AdaptiveCollocation, options: dict[str, Any], how: dict[str, Any]
@@ -160,7 +160,7 @@ class AdaptiveProblem:
     def _first_plans(
         self, mesh: DirectMethod, parameters: ByName, guesses: tuple[Guess, Solution | None], ends: list[str]
     ) -> list[Solution]:
-        """Return the plans to which the starts on a first mesh lead.
+        """Solve the problem on a first mesh from several starting points, and return the plans.
 
         ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
         """

@@ -14,10 +14,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import partial, wraps
-from types import TracebackType
 from typing import Any, ParamSpec, Self, TypeVar
 
 import casadi as ca
@@ -157,13 +156,12 @@ def time_limited(seconds: float | None, *, processor: bool = False) -> Iterator[
     The limit is on the wall time or, if `processor` is set, on the processor time of the program, so that what is found
     within it does not depend on other programs.
     """
-    clocks = time.monotonic(), time.process_time()
-    limits = (
-        np.inf if processor or seconds is None else seconds,
-        seconds if processor and seconds is not None else np.inf,
-    )
-    ends = [min(outer, now + limit) for outer, now, limit in zip(_DEADLINES.get(), clocks, limits, strict=True)]
-    token = _DEADLINES.set((ends[0], ends[1]))
+    wall_end, processor_end = _DEADLINES.get()
+    if seconds is not None and processor:
+        processor_end = min(processor_end, time.process_time() + seconds)
+    elif seconds is not None:
+        wall_end = min(wall_end, time.monotonic() + seconds)
+    token = _DEADLINES.set((wall_end, processor_end))
     try:
         yield
     finally:
@@ -265,21 +263,18 @@ def shown_progress(title: str, progress: Any) -> Iterator[None]:
         yield
         return
     if progress is None or isinstance(progress, bool):
-        line = Progress(title, quiet=progress is False, delay=CALL_DELAY_S)
+        display: Any = Progress(title, quiet=progress is False, delay=CALL_DELAY_S)
     elif callable(progress):
-        line = None
+        display = nullcontext(progress)
     else:
         words = f"progress must be a function of a stage's name, True, False or None, not {progress!r}"
         raise ProblemError(words, name="progress", value=progress)
-    token = _LISTENER.set(progress if line is None else line)
-    try:
-        if line is None:
+    with display as listener:
+        token = _LISTENER.set(listener)
+        try:
             yield
-        else:
-            with line:
-                yield
-    finally:
-        _LISTENER.reset(token)
+        finally:
+            _LISTENER.reset(token)
 
 
 def _is_interactive() -> bool:
@@ -323,9 +318,7 @@ class Progress:
             threading.Thread(target=self._watch, daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
         self._ended.set()
         with self._lock:
             self._wipe()
@@ -378,7 +371,7 @@ class IterationMonitor(ca.Callback):  # type: ignore[misc]
         self.line.__enter__()
 
     def close(self) -> None:
-        self.line.__exit__(None, None, None)
+        self.line.__exit__(None)
 
     def get_n_in(self) -> int:
         return int(ca.nlpsol_n_out())

@@ -16,12 +16,13 @@ import numpy as np
 
 from ocp.audit.audit import Audit, audit
 from ocp.audit.curvature import Curvature
+from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import optimality
 from ocp.console import interruptible, time_limited
 from ocp.direct.guess import Samples
 from ocp.direct.sensitivity import METHODS
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem, checked_problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.solution_data import call_registered, check_variables_match
@@ -170,16 +171,15 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
         SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
     """
     form = Formulation.of(solution.problem)
-    p = form.parameter_vector(solution.parameters)
-    bounds = form.bound_values(p)
     for _ in range(SETTINGS.descents):
         if not solution.regularised:
             break
-        curvature = optimality(form, solution, p, bounds, allowed=np.inf).curvature
+        along = Linearisation(form, solution)
+        curvature = optimality(along, np.inf).curvature
         if not curvature.least < -FLAT_SHARE:
             break
         attempts = [
-            prepared.solve(solution.parameters, _displaced_guess(form, solution, curvature, bounds, sign), check=False)
+            prepared.solve(solution.parameters, _displaced_guess(along, curvature, sign), check=False)
             for sign in (1.0, -1.0)
         ]
         plans = [attempt for attempt in attempts if attempt.success]
@@ -201,14 +201,13 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
     return solution
 
 
-def _displaced_guess(
-    form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
-) -> dict[str, Any]:
+def _displaced_guess(along: Linearisation, curvature: Curvature, sign: float) -> dict[str, Any]:
     """Return an initial guess: the plan plus or minus (``sign``) a variation of the plan that lowers the cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """
-    breaks = solution.control_interpolant.breaks * solution.horizon
+    form, solution, bounds = along.form, along.solution, along.bounds
+    breaks = along.mesh * solution.horizon
     times = np.union1d(breaks, curvature.t)
     fractions = times / solution.horizon
     plan = np.hstack([solution.state_interpolant(fractions), solution.control_interpolant(fractions)])

@@ -216,7 +216,7 @@ def _tightened(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit] | None:
-    """Return the plan under tightened limits and its audit; None unless it is feasible and loses hardly any cost.
+    """Return the plan under tightened limits and its audit; None unless it is feasible at hardly higher cost.
 
     It is tried where nothing but limits fails, such as bounds of a control near a singular arc.
     """

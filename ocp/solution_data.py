@@ -182,17 +182,6 @@ def match_order(form: Any, solution: Any) -> Any:
     return replace(solution, **changes) if changes else solution
 
 
-def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the amounts by which the bounds of a plan were tightened at M horizon fractions. Shape (2, M, m).
-
-    ``bound_tightening`` (2, N, m) holds them for each interval; at a node between two intervals the larger one counts.
-    """
-    last = len(mesh) - 2
-    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-NODE_TOLERANCE, NODE_TOLERANCE))
-    left, right = (bound_tightening[:, side] for side in sides)
-    return np.asarray(np.maximum(left, right))
-
-
 def check_structure(solution: Any) -> None:
     """Raise ProblemError, with the name of the faulty array, if the arrays of a plan are inconsistent.
 

@@ -64,7 +64,7 @@ class Switches(NamedTuple):
 
 
 def locate_switches(problem: Problem, solution: Solution) -> Switches:
-    """Return where limits of a plan become active or inactive, and the mesh intervals over which it smears them.
+    """Return the switches of a plan, where limits become active or inactive, and the mesh intervals that smear them.
 
     ``solution`` is a plan of ``problem`` by collocation with controls at the points.
     """
@@ -110,7 +110,7 @@ def locate_switches(problem: Problem, solution: Solution) -> Switches:
 
 @dataclass(frozen=True)
 class _Arcs:
-    """Values of quantities at the nodes of all intervals, continued from two intervals to where they meet.
+    """Quantities as polynomials on each interval, which can be extrapolated from two intervals to a point between.
 
     Attributes:
         breaks: Ends of the intervals. Shape (N + 1,).
@@ -123,7 +123,7 @@ class _Arcs:
     values: np.ndarray
 
     def crossing(self, i: int, j: int, columns: Any, spans: np.ndarray) -> float | None:
-        """Return where the arcs of intervals i and j meet, in the column with the largest jump, or else with a kink.
+        """Return where the arcs of intervals i and j meet, in the column with the largest jump, or in one with a kink.
 
         A jump must exceed a share of the column's span; it is where the arcs enclose the same area as the plan. Shape
         of ``spans``: (m,). None if there is neither.

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from ocp.audit.sizes import plan_at
 from ocp.console import interruptible, time_left, time_limited
 from ocp.direct.assembly import Transcription
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import check_meshed
 from ocp.errors import SolveError, SolverStatus, checked_time_limit, require
-from ocp.problem.formulation import Formulation
+from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.solution_data import NODE_TOLERANCE
@@ -80,13 +81,11 @@ def tighten(
         prepared = method.prepare(problem, options=options)
         form, transcription = prepared.formulation, prepared.transcription
         p = form.parameter_vector(require.mapping("tighten: parameters", parameters))
-        bounds = form.bound_values(p)
-        index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
-        low, high = bounds[0][index], bounds[1][index]
+        low, high = _limits_of(form, p)
         with np.errstate(invalid="ignore"):
             max_tightening = np.where(np.isfinite(high - low), (high - low) / 2, np.inf)
         places = _places(form, transcription, shared=method.control == "linear")
-        tightening = np.zeros((2, len(transcription.mesh) - 1, len(index)))
+        tightening = np.zeros((2, len(transcription.mesh) - 1, len(low)))
         move, previous = np.zeros_like(tightening), np.zeros_like(tightening)
         followed = np.full_like(tightening, SETTINGS.followed)
         best: tuple[Solution, str, dict[str, Any]] | None = None  # a plan, and its largest excess
@@ -138,9 +137,14 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
     """Return a plan's largest violation of a bound or inequality, also between grid points, in the bound's unit."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
+    return float(_excess(form, solution, p, *_limits_of(form, p))[0].max(initial=0.0))
+
+
+def _limits_of(form: Formulation, p: np.ndarray) -> Bounds:
+    """Return the lower and upper bounds of states, controls and path constraints. Shape (m,) each."""
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
-    low, high = (bound[index] for bound in form.bound_values(p))
-    return float(_excess(form, solution, p, low, high)[0].max(initial=0.0))
+    low, high = form.bound_values(p)
+    return low[index], high[index]
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
@@ -216,20 +220,15 @@ def _excess(
     n = len(breaks) - 1
     per_interval = (len(solution.state_interpolant.breaks) - 1) // n
     count = SETTINGS.places * (len(solution.state_interpolant.nodes) - 1) * per_interval
-    place = np.linspace(0.0, 1.0, count + 1)
-    owner = np.repeat(np.arange(n), len(place))
-    s = breaks[owner] + np.diff(breaks)[owner] * np.tile(place, n)
-    x = solution.state_interpolant(s)
-    u = solution.control_interpolant.within(owner, np.tile(place, n))
-    horizon = solution.horizon
-    g = form.sampled([form.path.expression], x, u, horizon * s, horizon, p)[0]
+    x, u, t = plan_at(solution, np.linspace(0.0, 1.0, count + 1))
+    g = form.sampled([form.path.expression], x, u, t, solution.horizon, p)[0]
     inequality = np.where(low < high, 1.0, np.nan)  # equalities are ignored
     values = np.hstack([x, u, g]) * inequality
     beyond = [
-        _peaks(np.where(np.isfinite(part), part, -np.inf).reshape(n, len(place), -1)).clip(min=0.0)
+        _peaks(np.where(np.isfinite(part), part, -np.inf).reshape(n, count + 1, -1)).clip(min=0.0)
         for part in (low - values, values - high)
     ]
-    return np.stack(beyond), breaks * horizon
+    return np.stack(beyond), breaks * solution.horizon
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:

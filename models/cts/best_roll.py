@@ -96,7 +96,7 @@ class Evaluation(NamedTuple):
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2, of joint angle 2, at which a constraint is active, and a lower bound of the cost near it.
+    """A value of cos q2 (joint angle 2) at which a constraint is active, and a lower bound of the cost near it.
 
     `side` is as in RoughRoll.
     """
@@ -114,7 +114,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Rig's inverse kinematics for one target: joint positions (6, 1), cost, codes of active constraint and status."""
+    """Inverse kinematics solution: joint positions (6, 1) of the rig, cost, codes of active constraint and status."""
 
     joints: Expression
     cost: Expression
@@ -248,7 +248,7 @@ class Search:
         """
         target, previous = _inputs(ca.MX)
         first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
-        best, more = self._cheap_ends()(target, previous, first)
+        best, more = self._closed_form_ends()(target, previous, first)
         columns = [evaluations, more]
         chart = yaw_chart(self.rig, self.branch)
         if not self.gain:
@@ -267,7 +267,7 @@ class Search:
         result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
-    def _cheap_ends(self) -> Any:
+    def _closed_form_ends(self) -> Any:
         """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
 
         (target, previous, best) -> (best, evaluations).
@@ -457,7 +457,7 @@ class Search:
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function that reports an infeasible target by joint positions nan and the reason as status."""
+        """Return the Function that reports an infeasible target: joint positions nan, and the reason as status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))

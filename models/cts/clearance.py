@@ -80,8 +80,8 @@ class Radii:
     sting: float = 0.75 * INCH
 
     def __post_init__(self) -> None:
-        for what, radius in vars(self).items():
-            require.nonnegative(f"radii: {what}", radius, unit="m")
+        for name, radius in vars(self).items():
+            require.nonnegative(f"radii: {name}", radius, unit="m")
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class CollisionScene:
     def __post_init__(self) -> None:
         if self.walls is not None:
             require.instance("scene: walls", self.walls, Box)
-        for what, kind in (("solids", Box), ("capsules", Capsule)):
-            object.__setattr__(self, what, require.each(f"scene: {what}", getattr(self, what), kind))
+        for name, kind in (("solids", Box), ("capsules", Capsule)):
+            object.__setattr__(self, name, require.each(f"scene: {name}", getattr(self, name), kind))
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:

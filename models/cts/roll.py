@@ -75,7 +75,7 @@ class Candidate(NamedTuple):
 
 
 class ConstraintCheck(NamedTuple):
-    """Boolean expressions that tell which reach constraints and joint limits are satisfied at a roll angle."""
+    """Boolean expressions that state which reach constraints and joint limits are satisfied at a roll angle."""
 
     pitch: Expression
     yaw: Expression
@@ -119,7 +119,7 @@ def limit_code(joint: int, upper: bool) -> int:
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1, a squared distance from the tunnel's centre, as harmonics of the roll angle.
+    """Return the cost index I1, a squared distance from the tunnel's centre, as a polynomial of roll harmonics.
 
     Equation (36) of Lee, Lee 2017.
     """
@@ -206,7 +206,7 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2, of joint angle 2, at which an interval of feasible roll angles may end.
+    """Return the values of cos q2 (joint angle 2) at which an interval of feasible roll angles may end.
 
     They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
     """
@@ -260,7 +260,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4, of joint 4, at which feasible roll angles may end, with codes of the limits."""
+    """Return the values of sin q4 (joint angle 4) at which feasible rolls may end, with codes of the limits."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -315,7 +315,7 @@ def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expre
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2, of joint 2, reaches a limit, on the feasible side despite rounding errors.
+    """Return the roll angle at which cos q2 (joint angle 2) has a limit value, on the feasible side despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
@@ -327,7 +327,7 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return the function of the roll angle whose root `polish` finds: the difference of cos q2 or q1 and a value.
+    """Return, as a function of the roll angle, cos q2 or q1 minus a value; `polish` finds the root of this function.
 
     `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
     derivative.

@@ -25,7 +25,7 @@ from models.robot.robot import Robot
 from models.shapes.bodies import Body, LinkMesh, MissingRule, RigidParts, collision_bodies, lever_arms
 from models.shapes.distance import COLUMNS, column, distance, pair_function, pair_wrenches, soft_minima, soft_minimum
 from models.shapes.pairs import ASSUMED, COVERED, IGNORED, IMMOBILE, RIGID, SRDF, Pairs, Reason, checked_pairs
-from models.shapes.shapes import KINDS, Box, MovingObstacle, Shape, checked_shape
+from models.shapes.shapes import SHAPE_KINDS, Box, MovingObstacle, Shape, checked_shape
 from models.spatial import Expression, Frame, expression
 
 WORLD = -1
@@ -44,7 +44,7 @@ class PlacedShape(NamedTuple):
 
 
 class Levers(NamedTuple):
-    """Upper bounds on the relative velocity of the two bodies of each of n pairs, per unit rate of each coordinate.
+    """Upper bounds of the relative velocity of the bodies of n pairs of bodies, per unit rate of each coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
@@ -58,7 +58,7 @@ class Levers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CollisionScene:
-    """The bodies of a machine, the obstacles, and the pairs of these that are checked for collision.
+    """The bodies of a machine, the obstacles, and the pairs of bodies and obstacles that are checked for collision.
 
     Attributes:
         machine: Any machine; the <collision> shapes of its robot are its bodies, see `models.shapes.bodies`.
@@ -109,7 +109,7 @@ class CollisionScene:
         return f"<CollisionScene of {self.machine!r}: {kinds}, {len(self.pairs)} pairs, clearance {self.clearance:g} m>"
 
     def __post_init__(self) -> None:
-        single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
+        single = isinstance(self.obstacles, (*SHAPE_KINDS, MovingObstacle))
         obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
         for number, obstacle in enumerate(obstacles):
             name = f"obstacles[{number}]"
@@ -141,14 +141,14 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the machine with some joints locked, without pairs that then cannot move relatively.
+        """Return the scene of the machine with some joints locked, without pairs that then keep their distance.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the pairs that the user excludes from checks: those of two links, and those with an obstacle."""
+        """Return the pairs that the user excludes from checks: of two links, and of a link and an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}
@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Pairs of links, named "A and B", unchecked because they seem to collide always; the reason for each pair."""
+        """Reason for each pair of links, named "A and B", that is not checked because it seems to collide always."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -318,7 +318,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative velocity of each pair of bodies; ModelError for a prismatic joint without limits."""
+        """Bounds on the relative velocity of each pair; raises ModelError for a prismatic joint without limits."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -351,7 +351,7 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies that are checked by convex hulls of meshes instead of covers, grouped by mesh.
+        """Return pairs of bodies that are checked by convex hulls of meshes, not covers, grouped by pair of meshes.
 
         They have at most three joints between them and may be closer by design than the covers of their meshes allow,
         or their covers always collide.
@@ -427,7 +427,7 @@ def _pair(value: Any, number: int) -> tuple[str, str]:
 
 
 def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[int, int]]], rounding: float) -> Any:
-    """Return the Function of `CollisionScene.distance_gradients` for groups of pairs, indices of two bodies.
+    """Return the CasADi Function of `CollisionScene.distance_gradients` for groups of pairs of body indices.
 
     Each distance is the minimum over one group.
     """
@@ -474,7 +474,7 @@ def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[i
 
 
 def _motion_signs(scene: CollisionScene, pairs: Array, joints: Sequence[str]) -> Array:
-    """Return 1 where a coordinate moves only the first body of a pair, -1 only the second, else 0. Shape (n, k)."""
+    """Return 1 where a coordinate moves only a pair's first body, -1 where only its second, else 0. Shape (n, k)."""
     size, carriers = scene.machine.base_size, scene._carriers
     carried = np.zeros((len(scene.bodies), size + len(joints)))
     for k, body in enumerate(scene.bodies):

@@ -126,8 +126,8 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian, (6, joint_size), equation (25): from joint rates to the tip's twist less the
-        drift.
+        """Return the generalized Jacobian, eq. (25), which maps joint rates to tip twist minus drift. Shape (6,
+        joint_size).
         """
         return self._tip_motion(base, self._reaction(q, None, tip=True))
 
@@ -139,7 +139,7 @@ class FreeFloating:
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the base twist E1^-1 (momentum - E2 joint_rates), equation (24). Shape (6, 1) or (3, 1)."""
+        """Return the base twist E1^-1 (momentum - E2 joint_rates), eq. (24) of Kim and Kim 2011. Shape (6 or 3, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
@@ -171,8 +171,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return the matrices E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24) of the
-        paper.
+        """Return E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24) of Kim and Kim (2011).
 
         Shapes (6, 6) and (6, joint_size), rows (moment of momentum about the world's origin, linear momentum), world
         axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
@@ -224,9 +223,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion, given by its rates, minus the conserved momentum; zero for every possible
-        motion.
-        """
+        """Return the momentum at given rates minus the conserved momentum, zero for every possible motion."""
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
         if carried is None:
@@ -237,7 +234,7 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates, equation (25) of the paper.
+        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates, equation (25) of Kim and Kim (2011).
 
         Shapes (6, 6), or (6, 3) for a planar base, and (6, joint_size).
         """

@@ -65,7 +65,7 @@ class Machine(Protocol):
         """Return the frame of the tip in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the matrix, (6, joint_size), from joint rates to the tip's twist, including the base motion that they
+        """Return the matrix, (6, joint_size), that maps joint rates to the tip's twist, including the base motion they
         cause.
         """
 
@@ -135,7 +135,7 @@ class FixedBase:
         return Frame(*self._pose_function(joint_vector(self.robot, q)))
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the geometric Jacobian of the tip. Shape (6, joint_size)."""
+        """Return the geometric Jacobian of the tip in world axes. Shape (6, joint_size)."""
         self.world_from_base(base)
         return self._jacobian_function(joint_vector(self.robot, q))
 
@@ -153,7 +153,7 @@ class FixedBase:
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the twist of the tip. Shape (6, 1)."""
+        """Return the tip's twist (angular, linear) in world axes, tip_jacobian times joint_rates. Shape (6, 1)."""
         return ca.mtimes(self.tip_jacobian(base, q), joint_vector(self.robot, joint_rates, "joint_rates"))
 
     @on_scalars
@@ -169,7 +169,7 @@ class FixedBase:
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the machine with its tip at another frame, which is fixed in any of its links.
+    """Return the machine with its tip at another frame, which is fixed in one of its links.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.

@@ -135,10 +135,10 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi, zero for the quill, that shifts positions from `least` to `most` into a joint's
-        limits.
+        """Return the multiple of 2 pi (0 for the quill) that shifts the range `least` to `most` into the limits of a
+        joint.
 
-        None if there is none; the tolerance is 1e-9.
+        Return None if no multiple does; the tolerance is 1e-9 rad or m.
         """
         low, high = float(self.lower[joint]) - 1e-9, float(self.upper[joint]) + 1e-9
         turn = 0.0
@@ -169,9 +169,7 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from tool pose (x, y, z, yaw) and three derivatives to joints and three
-        derivatives.
-        """
+        """Return the CasADi Function from pose (x, y, z, yaw) and three derivatives to joint positions and theirs."""
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
         pose = inputs[0] + at * (inputs[1] + at * (inputs[2] / 2 + at * inputs[3] / 6))
@@ -182,11 +180,11 @@ class Scara:
         here = ca.substitute(outputs, [at], [ca.SX(0)])
         return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
 
-    def check_reach(self, radius: float, what: str) -> None:
-        """Raise ModelError, which names `what`, unless the arm reaches points `radius` (m) from the shoulder axis."""
+    def check_reach(self, radius: float, place: str) -> None:
+        """Raise ModelError, which names `place`, unless the arm reaches points `radius` (m) from the shoulder axis."""
         if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
-                f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
+                f"scara: {place} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
                 f"{self.inner:g} to {self.outer:g} m"
             )
             raise ModelError(message, name="radius", value=radius, limit=(self.inner, self.outer))
@@ -197,7 +195,7 @@ ANGLES = [0, 1, 3]
 
 
 class JointsAlong(NamedTuple):
-    """Joint positions along a path and three derivatives by arc length. Shape (M, 4) each, rad and m."""
+    """Joint positions along a path and three derivatives with respect to arc length. Shape (M, 4) each, rad and m."""
 
     position: Array
     first: Array
@@ -207,7 +205,7 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them."""
+    """Joint positions of a SCARA arm along a path of its tool, computed by `scara_along`."""
 
     scara: Scara  # the arm
     path: SmoothPath  # path of the tool
@@ -329,9 +327,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return place (arc length) and value of the maximum (sign 1) or minimum (-1) of a function, refined between
-    samples.
-    """
+    """Return arc length and value of a function's maximum (`sign` 1) or minimum (-1), refined between samples."""
     padded = np.concatenate([[-np.inf], sign * values, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
     # a resolved peak exceeds its sample by less than the sample differs from its neighbours

@@ -72,7 +72,7 @@ class Foot:
 
     @cached_property
     def corners(self) -> Array:
-        """Corners of the sole in the sole's frame; only the origin of that frame for a grip. Shape (k, 3), m."""
+        """Corners of the sole in the sole's frame; for a grip, the origin of that frame alone. Shape (k, 3), m."""
         if self.sole is None:
             return np.zeros((1, 3))
         plane = np.asarray(self.sole.vertices)
@@ -166,7 +166,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links that fixed joints connect merged, whose dynamics are the same and faster to evaluate."""
+        """The robot after merging links that fixed joints connect: the same dynamics, evaluated faster."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:

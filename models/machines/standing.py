@@ -114,7 +114,7 @@ class Standing(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with links that fixed joints connect merged, except links on which given wrenches act."""
+        """Return the robot after merging links that fixed joints connect, except links on which given wrenches act."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -151,13 +151,13 @@ class Standing(FixedBase):
         return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:
-        """Return 1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6). Shape (2, 1)."""
+        """Return 1 - ((point - most_stable_point) / half_widths)^2, (5) and (6) of Yoo et al. 2004. Shape (2, 1)."""
         offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the condition, (18) of the paper, that fixes the zero moment point at `point`, (2,), m; wrenches enter
-        C.
+        """Return condition (18) of Yoo et al. 2004, which fixes the zero moment point at `point`, (2,), m, under
+        `wrenches`.
         """
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector("point", point, 2, "x and y on the ground")
@@ -262,7 +262,7 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Horizontal over vertical ground force, the friction coefficient required; inf without contact. Shape (M,)."""
+        """Friction coefficient required: horizontal over vertical ground force; inf without contact. Shape (M,)."""
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
@@ -313,7 +313,7 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function (time, q, qd, qdd) -> the computed attributes of a `StandingMotion`, by name.
+    """Return the CasADi Function from (time, q, qd, qdd) to the computed attributes of a `StandingMotion`, by name.
 
     Its symbols are SX, or MX if `external` requires it.
     """

@@ -1,4 +1,4 @@
-"""Task paths of lines, arcs, helices and splines with tool orientation and rounded corners, by distance."""
+"""Task paths of lines, arcs, helices and splines with tool orientation and rounded corners, given by distance."""
 
 from models.paths.blends import gamma, gauss_newton, march, predictor_corrector, rest_to_rest
 from models.paths.path import Path, fit_splines, split_at_reversals

@@ -47,7 +47,7 @@ The distance at u = 1/2 is |1 - c shape| cos(angle/2) times the remaining distan
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return shape factors of blends (end tangents over remaining distance) after checking them. Shape (count,).
+    """Return shape factors of blends (end derivative over distance from the corner) after checks. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -74,8 +74,7 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the coefficients of the cubic curve with given end points and first derivatives, eqs (1) to (7) of the
-    paper.
+    """Return the coefficients of the cubic with given end points and first derivatives, eqs (1)-(7) of Lee et al. 2006.
 
     The derivatives are in the curve parameter u. Shapes (..., 3) to (..., 6, 3).
     """
@@ -121,7 +120,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the distance of a blend's middle from its corner between two lines, relative to that of the blend's ends.
+    """Return how far a blend's middle is from the corner between two lines, divided by how far its ends are from it.
 
     Equation (8): |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, the distance
     at u = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -181,7 +180,7 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return angles (rad) between two lines, and the best shape factor over the distance of the blend's ends."""
+    """Return angles (rad) between two lines, and the best shape factors divided by the distance between blend ends."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -347,7 +346,7 @@ def cells(coefficients: Array) -> Cells:
 def parameter(
     coefficients: Array, cells: Cells, index: NDArray[np.intp], distance: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the curve and the curve parameter u at distances (m) from the starts of cells, intervals of u. Shape (M,).
+    """Return index and parameter u of curves at distances (m) from the starts of cells, intervals of u; (M,) each.
 
     A cubic Hermite guess from the cell's ends is refined to rounding by Chebyshev iterations.
 
@@ -470,7 +469,7 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
-    """Return symbols of state, coefficients and steps of a mapping, and the function from u to the speed |dr/du|."""
+    """Return symbols of the inputs of a `march` mapping (state, coefficients, steps), and the function u -> |dr/du|."""
     degree = require.choice("blend: degree", degree, (3, 5))
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())

@@ -257,7 +257,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return segments as a tuple; raise a ModelError if there are none or one is no segment."""
+    """Return segments as a tuple; raise a ModelError if the list is empty or an entry is no segment."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -410,7 +410,7 @@ def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: fl
 def _replace_run(
     segments: Sequence[Segment], line: Polyline, tolerance: float, angle: float
 ) -> tuple[Segment, float] | None:
-    """Return one segment in place of a run of segments and a bound of its deviation (m), or None if that fails."""
+    """Return one segment in place of a run of segments and a bound of its deviation (m), or None if no segment fits."""
     (points, quaternions), deviation = line, float(distances_from_chord(line.points).max())
     is_line = deviation <= min(RUNS.simplified * tolerance, float(np.linalg.norm(points[-1] - points[0])))
     is_line &= quaternions is None or bool((np.diff(quaternions, axis=0) == 0).all())

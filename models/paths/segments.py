@@ -191,7 +191,7 @@ class Arc(_Circular):
             ModelError: Points coincide or are collinear.
         """
         points = {"start": start, "via": via, "end": end}
-        a, b, c = (require.array(f"arc: {what}", point, (3,)) for what, point in points.items())
+        a, b, c = (require.array(f"arc: {name}", point, (3,)) for name, point in points.items())
         ab, ac = b - a, c - a
         axis = np.cross(ab, ac)
         area, size = float(np.linalg.norm(axis)), float(np.linalg.norm(ab) * np.linalg.norm(ac))
@@ -352,13 +352,13 @@ LARGEST_TURN = np.pi - 1e-3
 """Largest angle (rad) allowed between two orientations; near pi the shorter of the two rotations is ambiguous."""
 
 
-def unit_quaternion(value: ArrayInput, what: str) -> Array:
+def unit_quaternion(value: ArrayInput, label: str) -> Array:
     """Return `value` as a read-only unit quaternion [w, x, y, z]; raise a ModelError if its norm is not 1."""
-    quaternion = require.array(f"{what}: quaternion", value, (4,))
+    quaternion = require.array(f"{label}: quaternion", value, (4,))
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-6:
-        message = f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"
-        raise ModelError(message, name=what, value=quaternion, limit=1.0)
+        message = f"{label}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"
+        raise ModelError(message, name=label, value=quaternion, limit=1.0)
     return freeze(quaternion / norm)
 
 

@@ -432,7 +432,7 @@ def _cell_function() -> Any:
 
 
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the distances at which parts of the path start, then its length, and a data column for each part.
+    """Return the distances at which parts of the path start, followed by its length, and a data column for each part.
 
     A part is what remains of a line, arc or helix, or a cell of a curve. A segment has its start point, the axial,
     tangential and inward vectors of its screw, and its rotation rate; a curve its coefficients. Both have distance,

@@ -148,12 +148,12 @@ class Spline:
 
     @property
     def start_orientation(self) -> Array | None:
-        """Tool orientation at the spline's start, unit quaternion; None if it states none. Shape (4,)."""
+        """Tool orientation at the spline's start, unit quaternion; None if not specified. Shape (4,)."""
         return self._orientation(0, np.array([1.0, 0, 0, 0, 0, 0]))
 
     @property
     def end_orientation(self) -> Array | None:
-        """Tool orientation at the spline's end, unit quaternion; None if it states none. Shape (4,)."""
+        """Tool orientation at the spline's end, unit quaternion; None if not specified. Shape (4,)."""
         return self._orientation(-1, np.ones(6))
 
     def _orientation(self, piece: int, powers: Array) -> Array | None:
@@ -192,7 +192,7 @@ class SplineTable(NamedTuple):
 
 
 def _between(coefficients: Array, first: Array, last: Array) -> Array:
-    """Return polynomial curves reparametrised so that 0 to 1 is the part from `first` to `last`. Shape (P, 6, 3)."""
+    """Return polynomial curves whose parameters 0 to 1 span the part from `first` to `last`. Shape (P, 6, 3)."""
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
     matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
@@ -219,7 +219,7 @@ FIT = FitSettings()
 
 
 def fit_spline(line: Polyline, deviation: float, angle: float, max_pieces: int) -> tuple[Spline, float] | None:
-    """Fit a spline to a polyline, whose ends it meets; return it with a bound of its deviation, m, or None.
+    """Fit a spline to a polyline, exactly at its ends; return it and a bound of its deviation, m, or None.
 
     Args:
         deviation: Largest distance (m) between points of equal parameter of polyline and spline.
@@ -277,7 +277,7 @@ def _pieces(curve: scipy.interpolate.BSpline, knots: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _bernstein() -> Array:
-    """Return the matrix from values at six equidistant points to Bernstein coefficients of degree 5. Shape (6, 6)."""
+    """Return the matrix, (6, 6), that maps values at six equidistant points to Bernstein coefficients of degree 5."""
     u, k = np.linspace(0, 1, FIT.degree + 1)[:, None], np.arange(FIT.degree + 1)
     return np.linalg.inv(scipy.special.comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
 

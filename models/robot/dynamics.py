@@ -166,13 +166,13 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Expression]:
-    """Return moment, force and point of application of one external wrench, given the matrix of `stacked_wrenches`."""
+    """Return moment, force and point of application of one external wrench, a column of `stacked_wrenches`."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the twist of a moving base and its time derivative, (None, None) for a base at rest."""
+    """Return the twist of a moving base and its time derivative, or (None, None) for a base at rest."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -243,43 +243,41 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return each link's acceleration of the origin less gravity, (3, 1), and `_field`, in link axes."""
+    """Return each link's acceleration of the origin minus gravity, (3, 1), and matrix of `_field`, in link axes."""
     rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
-    twist, push = (
+    twist, twist_rate = (
         ca.DM(6, 1) if vector is None else checked_vector(name, vector, 6, meaning)
         for vector, name in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
     )
     # angular velocity, angular acceleration, acceleration of the origin less gravity
-    spin, turning, acceleration = (
-        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], push[0:3], push[3:6] - g)
+    omega, alpha, acceleration = (
+        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], twist_rate[0:3], twist_rate[3:6] - g)
     )
-    origin = {robot.root: (spin, turning, acceleration)}
-    fields = {robot.root: (acceleration, _field(spin, turning))}
+    origin = {robot.root: (omega, alpha, acceleration)}
+    fields = {robot.root: (acceleration, _field(omega, alpha))}
     for joint in robot.joints:
         turn, position = joints[joint.name]
-        spin, turning, acceleration = origin[joint.parent]
+        omega, alpha, acceleration = origin[joint.parent]
         acceleration = acceleration + ca.mtimes(fields[joint.parent][1], position)
-        spin, turning, acceleration = (ca.mtimes(turn.T, part) for part in (spin, turning, acceleration))
+        omega, alpha, acceleration = (ca.mtimes(turn.T, part) for part in (omega, alpha, acceleration))
         if joint.moves:
-            rate, push = (constant(joint.axis) * part[joint.name] for part in (rates, accelerations))
+            rate, joint_acceleration = (constant(joint.axis) * part[joint.name] for part in (rates, accelerations))
             if joint.kind == "prismatic":
-                acceleration = acceleration + push + 2 * cross(spin, rate)
+                acceleration = acceleration + joint_acceleration + 2 * cross(omega, rate)
             else:
-                turning = turning + push + cross(spin, rate)
-                spin = spin + rate
-        origin[joint.child] = (spin, turning, acceleration)
-        fields[joint.child] = (acceleration, _field(spin, turning))
+                alpha = alpha + joint_acceleration + cross(omega, rate)
+                omega = omega + rate
+        origin[joint.child] = (omega, alpha, acceleration)
+        fields[joint.child] = (acceleration, _field(omega, alpha))
     return fields
 
 
-def _field(spin: Expression, turning: Expression) -> Expression:
-    """Return the matrix [alpha x] + [omega x]^2 from a point of a body to its acceleration relative to the body's
-    origin.
-    """
-    squares = ca.mtimes(spin, spin.T)
-    return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)
+def _field(omega: Expression, alpha: Expression) -> Expression:
+    """Return [alpha x] + [omega x]^2, which maps a body's point to its acceleration relative to the body's origin."""
+    squares = ca.mtimes(omega, omega.T)
+    return skew(alpha) + squares - ca.trace(squares) * ca.DM.eye(3)
 
 
 class MassMoments(NamedTuple):
@@ -294,7 +292,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return angular (about the world's origin) and linear momentum of the bodies if all have a given twist."""
+        """Return the angular (about the world's origin) and linear momentum of the bodies for a common twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -305,7 +303,7 @@ class MassMoments(NamedTuple):
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the matrix from joint rates to the velocity of the robot's centre of mass, world axes. Shape (3, dof)."""
+    """Return the matrix, (3, dof), that maps joint rates to the velocity of the centre of mass, in world axes."""
     matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
         raise massless_error("hence no centre of mass")
@@ -313,7 +311,7 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the matrix, (6, dof), from joint rates to (angular momentum about the world's origin, linear momentum)."""
+    """Return the matrix, (6, dof), that maps joint rates to (angular about the world's origin, linear) momentum."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     moments = subtree_moments(robot, frames)
     return ca.densify(joint_momenta(robot, axes, moments))
@@ -343,7 +341,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the matrix from joint rates to momentum, (6, dof), from results of frames_and_axes and subtree_moments."""
+    """Return the matrix, (6, dof), that maps joint rates to momentum, from `frames_and_axes` and `subtree_moments`."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *reduce_to_joint_vector(robot, momenta))
@@ -373,7 +371,7 @@ def momentum_rate(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the rate of the robot's angular momentum about a fixed point and of its linear momentum. Shape (6, 1).
+    """Return the rate of change of the robot's angular momentum about a fixed point and of its linear momentum, (6, 1).
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
@@ -383,6 +381,6 @@ def momentum_rate(
 
 
 def _about_point(point: Expression, wrench: Expression) -> Expression:
-    """Return a wrench or momentum about a given point, given the one about the world's origin. Shape (6, 1)."""
+    """Convert a wrench or momentum about the world's origin to one about another point. Shape (6, 1)."""
     arm = checked_vector("about", point, 3, "a point of the world")
     return ca.densify(ca.vertcat(wrench[0:3] - cross(arm, wrench[3:6]), wrench[3:6]))

@@ -77,19 +77,19 @@ def checked_placement(placement: Placement | None, label: str = "world_from_base
     return Frame(orientation, position)
 
 
-def expand_joint_vector(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
-    """Return the entry of a joint vector for each moving joint, by name; for a mimic joint, times its multiplier.
+def expand_joint_vector(robot: Robot, vector: Expression, label: str = "q") -> dict[str, Expression]:
+    """Return a joint vector's entries for all moving joints by name; entries of mimic joints include their multipliers.
 
     Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """
-    vector = joint_vector(robot, vector, what)
+    vector = joint_vector(robot, vector, label)
     return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
 def reduce_to_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
-    """Return a quantity, such as torque, for each entry of the joint vector from those of all moving joints, by name.
+    """Convert a quantity such as torque from values of all moving joints, by name, to entries of the joint vector.
 
-    Each entry is that of the joint itself plus multiplier times those of the joints that mimic it.
+    An entry is the joint's own value plus, for each joint that mimics it, the multiplier times the mimic's value.
     """
     entries = [by_joint[name] for name in robot.joint_names]
     for joint in robot.joints:
@@ -100,7 +100,7 @@ def reduce_to_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> 
 
 
 def coupling_matrix(robot: Robot) -> ca.DM:
-    """Return the matrix from rates of the joint vector to those of all moving joints. Shape (moving joints, dof)."""
+    """Return the matrix, (moving joints, dof), that maps rates of the joint vector to rates of all moving joints."""
     rows = np.zeros((len(robot.couplings), robot.dof))
     for row, (column, ratio, _) in zip(rows, robot.couplings.values(), strict=True):
         row[column] = ratio
@@ -146,7 +146,7 @@ def frame_jacobian(
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the matrix, (6, dof), from joint rates to the (angular, linear) velocity of a point of a link, in world
+    """Return the matrix, (6, dof), that maps joint rates to (angular, linear) velocity of a link's point, in world
     axes.
 
     Columns of joints that do not carry the link are zero.
@@ -168,7 +168,7 @@ def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | Non
 
 
 def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the matrix, (6, dof), from joint rates to the tip's (angular, linear) velocity in world axes."""
+    """Return the matrix, (6, dof), that maps joint rates to the tip's (angular, linear) velocity in world axes."""
     tip = require.instance("kinematics: robot", robot, Robot).tip_link
     return frame_jacobian(robot, q, tip, point=robot.tip_translation, world_from_base=world_from_base)
 
@@ -176,7 +176,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the geometric Jacobian, (6, dof), of a point of a link, in world, from joint axes of frames_and_axes."""
+    """Return the geometric Jacobian, (6, dof), of a link's point in world axes from the axes of `frames_and_axes`."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -275,28 +275,28 @@ def link_motions(
     # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
     for joint in robot.joints:
-        velocity, acceleration, spin, turning = origin[joint.parent]
+        velocity, acceleration, omega, alpha = origin[joint.parent]
         arm = frames[joint.child].position - frames[joint.parent].position
-        swing = cross(spin, arm)
-        velocity, acceleration = velocity + swing, acceleration + cross(turning, arm) + cross(spin, swing)
+        swing = cross(omega, arm)
+        velocity, acceleration = velocity + swing, acceleration + cross(alpha, arm) + cross(omega, swing)
         if joint.moves:
             angular, linear = axes[joint.name]
-            rate, push = rates[joint.name], accelerations[joint.name]
+            rate, joint_acceleration = rates[joint.name], accelerations[joint.name]
             if joint.kind == "prismatic":
                 velocity = velocity + linear * rate
-                acceleration = acceleration + linear * push + 2 * cross(spin, linear * rate)
+                acceleration = acceleration + linear * joint_acceleration + 2 * cross(omega, linear * rate)
             else:
-                turning = turning + angular * push + cross(spin, angular * rate)
-                spin = spin + angular * rate
-        origin[joint.child] = (velocity, acceleration, spin, turning)
+                alpha = alpha + angular * joint_acceleration + cross(omega, angular * rate)
+                omega = omega + angular * rate
+        origin[joint.child] = (velocity, acceleration, omega, alpha)
     motions = {}
     for link in robot.links:
-        velocity, acceleration, spin, turning = origin[link.name]
+        velocity, acceleration, omega, alpha = origin[link.name]
         center = frames[link.name].point(link.center_of_mass)
         arm = center - frames[link.name].position
-        swing = cross(spin, arm)
-        acceleration = acceleration + cross(turning, arm) + cross(spin, swing)
-        motions[link.name] = LinkMotion(center, velocity + swing, acceleration, spin, turning)
+        swing = cross(omega, arm)
+        acceleration = acceleration + cross(alpha, arm) + cross(omega, swing)
+        motions[link.name] = LinkMotion(center, velocity + swing, acceleration, omega, alpha)
     return motions
 
 
@@ -330,7 +330,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """Return the largest violation of a joint position limit, negative within limits, -inf without. Shape (1, 1)."""
+    """Return the largest violation of a joint limit: negative inside all limits, -inf without limits. Shape (1, 1)."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:
@@ -340,7 +340,7 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """Return sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985), zero where the task is singular.
+    """Return sqrt(det(G_r G_r')) of selected rows G_r of a tip Jacobian (Yoshikawa 1985), zero at task singularities.
 
     Args:
         jacobian: Shape (6, n).

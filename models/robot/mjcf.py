@@ -1,4 +1,4 @@
-"""Reading of robot descriptions in MJCF, the XML format of MuJoCo, whose own compiler resolves classes and frames.
+"""Reading of robot descriptions in MJCF, the XML format of MuJoCo; MuJoCo's own compiler resolves classes and frames.
 
 A file from a stranger is reduced before the compiler sees it to the parts that describe bodies, joints, shapes and
 actuators, so that it loads no plugin, simulates nothing and expands no repetition. Files are opened here, and included
@@ -147,7 +147,7 @@ class _ReducedFile(NamedTuple):
 
 
 def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:
-    """Read an MJCF description, reduced to what describes a robot; append words on omitted constraints."""
+    """Read an MJCF description, keep only the elements that describe a robot, and note omitted constraints."""
     tree, origin = parse_file(source, "MJCF")
     if tree.tag != "mujoco":
         hint = "; read URDF with Robot.from_urdf" if tree.tag == "robot" else ""
@@ -221,8 +221,7 @@ def _is_read(part: ElementTree.Element, parent: str) -> bool:
 
 
 def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
-    """Return MuJoCo's compiled model, with spheres for meshes, and by index of the geom the mesh that each sphere
-    replaces.
+    """Return MuJoCo's compiled model, in which spheres replace meshes, and each replaced mesh by index of its geom.
 
     The mesh is None for height fields and fitted primitives. Mesh files are opened only if masses follow from them.
     """
@@ -263,8 +262,8 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
 
 
 def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any, str]]:
-    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return these geoms with
-    mesh names.
+    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return spheres and mesh
+    names.
 
     The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh "".
     """
@@ -281,7 +280,7 @@ def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any
 def _body_shapes(
     model: Any, meshes: Mapping[int, Any], reduced: _ReducedFile, omitted: list[str]
 ) -> list[dict[str, Any]]:
-    """Return the shapes of each body as arguments of Link, given results of _compile; append words on omitted ones."""
+    """Return each body's shapes as arguments of `Link`, from the results of `_compile`; note shapes left out."""
     shapes: list[dict[str, Any]] = [{"collisions": (), "visuals": ()} for _ in range(model.nbody)]
     for k in range(model.ngeom):
         parts = shapes[model.geom_bodyid[k]]
@@ -310,7 +309,7 @@ def _body_shapes(
 
 
 def _primitive(number: int, size: Array) -> tuple[ShapeKind, tuple[float, ...]]:
-    """Return kind and size of a shape from MuJoCo's type number and half sizes of a geom; no size for a plane."""
+    """Return kind and size of a shape from a geom's type number and half sizes in MuJoCo; a plane has no size."""
     a, b, c = size.tolist()
     kinds: dict[int, tuple[ShapeKind, tuple[float, ...]]] = {
         2: ("sphere", (a,)),
@@ -337,7 +336,7 @@ def _kind(model: Any, j: int) -> Kind:
 
 
 def _effort(model: Any, j: int) -> float:
-    """Return the effort limit of a joint, N m or N, by force ranges of joint and actuators; infinite without any."""
+    """Return the effort limit of a joint, N m or N, from force ranges of joint and actuators; inf without any range."""
     limits = []
     for k in range(model.nu):
         if model.actuator_trntype[k] > 1 or model.actuator_trnid[k, 0] != j:
@@ -355,7 +354,7 @@ def _effort(model: Any, j: int) -> float:
 
 
 def _equalities(model: Any, omitted: list[str]) -> tuple[dict[int, Mimic], dict[int, float]]:
-    """Return couplings and locked positions by number of the joint; append words on other constraints."""
+    """Return couplings and locked positions of joints, by joint number; note other constraints in `omitted`."""
     mimics: dict[int, Mimic] = {}
     locked: dict[int, float] = {}
     for k in (k for k in range(model.neq) if model.eq_active0[k]):

@@ -385,9 +385,7 @@ def _write_origin(element: ElementTree.Element, translation: Array, rotation: Ar
 
 
 def _rpy(rotation: Array) -> Array:
-    """Return roll, pitch and yaw of a rotation matrix, (3,), rad; at pitch +-pi/2 yaw is arbitrary and roll relative to
-    it.
-    """
+    """Return roll, pitch and yaw of a rotation matrix, (3,), rad; at pitch +-pi/2 one of many equivalent triples."""
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y axis of the frame rotated by yaw alone

@@ -129,7 +129,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Return one robot that consists of several, such as arms, on a common base; its tip is that of the first of them.
+    """Return one robot made of several robots, such as arms, on a common base; its tip is the tip of the first of them.
 
     Args:
         base: A link or a robot that carries the arms.
@@ -218,7 +218,7 @@ def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Return the robot with links on fixed joints merged into the links that carry them; its dynamics stay the same.
+    """Return the robot with links on fixed joints merged into the links that carry them, which keeps its dynamics.
 
     The tip frame, the names and order of the moving joints and the frames of their links are unchanged.
 
@@ -259,7 +259,7 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """Return a link to which masses and shapes of others, at given poses (rotation, translation) in it, are added."""
+    """Return a link to which the masses and shapes of other links, at poses (rotation, translation), are added."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
     visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
     link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))

@@ -227,7 +227,7 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, JointCoupling]:
-        """How each moving joint's position follows from an entry of the joint vector, by joint name."""
+        """Coupling of each moving joint's position to an entry of the joint vector, by joint name."""
         return joint_couplings(self.joints)
 
     @property

@@ -25,7 +25,7 @@ from models.spatial import least_rotation
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
-    """Raise ModelError if a name of a link or joint occurs twice among given names."""
+    """Raise ModelError if a name of a link or joint occurs more than once."""
     for name, count in Counter(names).items():
         if count > 1:
             message = f"{kind} name {name!r} is used more than once; give every {kind} its own name"
@@ -70,7 +70,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Return the indices of the joints so that every joint precedes its descendants, else in the order of declaration.
+    """Return the indices of the joints in order of declaration, except that each joint precedes all its descendants.
 
     Raises:
         ModelError: Some links form a loop that is not connected to the root.
@@ -175,7 +175,7 @@ def resolve_mimics(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return all joints of a robot, with those named in `positions`, and those that mimic them, locked.
+    """Return all joints of a robot after locking the joints named in `positions` and the joints that mimic them.
 
     Positions are in rad or m, by joint name. Other joints that cannot move are locked too: those that mimic a fixed
     joint (which counts as being at 0), or any joint with multiplier 0. A mimic joint that is locked by its own name is
@@ -280,7 +280,7 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return the links and joints of a robot without a floating joint, for which the fixed joint `place` stands.
+    """Return a robot's links and joints after replacing or omitting a floating joint, given as the fixed joint `place`.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
@@ -306,7 +306,7 @@ def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint
 def _replace_by_chain(
     place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
 ) -> Parts:
-    """Return a robot with one joint replaced by several; `steps` has suffix of the name, kind and axis of each."""
+    """Return a robot with one joint replaced by several; `steps` states name suffix, kind and axis of each of these."""
     new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
     ends = [place.parent, *(link.name for link in new_links), place.child]
     chain = [

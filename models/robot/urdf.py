@@ -1,4 +1,4 @@
-"""Reading of robot descriptions in URDF, the XML format of ROS, also from xacro; `parts` writes them.
+"""Reading of robot descriptions in URDF, the XML format of ROS, also from files of its macro language xacro.
 
 <transmission>, <gazebo>, <safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped.
 Faults that other readers accept are left out with a warning that names them. Mesh files are recorded by name and
@@ -120,7 +120,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
 
 def omission_warning(omitted: Sequence[str], origin: str) -> None:
-    """Warn about the parts of a robot description that are left out, if any, and name the description."""
+    """Warn about the parts of a robot description that are left out, if there are any, and name the description."""
     if omitted := list(dict.fromkeys(omitted)):
         more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
         message = f"{origin}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"
@@ -188,7 +188,7 @@ def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.
 
 
 def parse_file(source: Source, kind: str, unbound: list[str] | None = None) -> tuple[ElementTree.Element, str]:
-    """Return the root element of an XML text or file, and words that name the text or file in error messages.
+    """Return the root element of an XML text or file, and a phrase that names this source in error messages.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
@@ -300,9 +300,7 @@ def _shape(
     omitted: list[str],
     **arguments: Any,
 ) -> list[_Shape]:
-    """Return a list of the shape of a <collision> or <visual> element, empty if it has no volume, which is noted in
-    `omitted`.
-    """
+    """Return a list of the shape of a <collision> or <visual> element; if it has no volume, note it and return []."""
     shapes: list[Any] = list(child_of(element, "geometry", owner))
     if not shapes:
         raise ModelError(f"{owner}: <geometry> has 0 shapes, not one", name="geometry", value=0, limit=1)

@@ -28,7 +28,7 @@ PARALLEL = 1e-18
 
 
 class SegmentCore(NamedTuple):
-    """The point or segment from which a ball or capsule arises by sweeping a sphere: one point, or the two ends."""
+    """The point or segment that forms a ball or capsule if a sphere sweeps along it: one point, or the two ends."""
 
     points: tuple[Triple, ...]
 
@@ -42,12 +42,12 @@ class BoxCore(NamedTuple):
 
 
 def keep_gradient(value: Expression) -> Expression:
-    """Return an expression unchanged; it takes the place of `StoppedGradients` where all derivatives are kept."""
+    """Return an expression unchanged; it replaces `StoppedGradients` where differentiation keeps all derivatives."""
     return value
 
 
 def triple(entries: Iterable[Expression]) -> Triple:
-    """Return three entries as a tuple (x, y, z)."""
+    """Return the three entries of a vector as a tuple (x, y, z)."""
     x, y, z = entries
     return x, y, z
 
@@ -82,13 +82,13 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a distance from its square, or a lower bound of it if the square is too large by up to `excess` > 0."""
+    """Return a distance from its square; if the square may be too large by `excess`, a lower bound of the distance."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """Return the smaller of a gap and zero, or a smooth lower bound of it, at most `rounding` / 4 below."""
+    """Return the smaller of a gap and zero, or a smooth lower bound of this value, at most `rounding` / 4 below it."""
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
@@ -269,7 +269,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the twelve edges of a box from another box, in whose axes the first is given.
+    """Return the squared distances of a box's twelve edges from another box, in whose axes the first box is given.
 
     With the corners of the other box they suffice: from a closest point inside a face one can slide to a corner or an
     edge.

@@ -35,7 +35,7 @@ class CoverSettings:
     parts: int = 3  # largest number of capsules; distances of more would cost more than their fit saves
     worth_a_part: float = 1.07  # factor by which volume (or overhang, by its fourth root) must fall for a part
     worth_a_box: float = 0.7  # volume of the box over that of the capsules below which the box is taken
-    cuts: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
+    split_levels: tuple[float, ...] = (0.12, 0.25, 0.38, 0.5, 0.62, 0.75, 0.88)  # relative positions of trial planes
     growth: float = 1e-9  # margin added to covers, larger than rounding errors
     thinnest: float = 1e-6  # smallest thickness of a box, which must not be zero
     directions: int = 48  # initial directions of capsule axes on a hemisphere
@@ -58,7 +58,7 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes."""
+    """A capsule or box that, alone or with others, covers a mesh, and how far it protrudes from the mesh."""
 
     shape: CoverShape  # capsule or box in the frame of the mesh
     overhang: float  # largest distance of sampled surface points of the shape from the convex hull of the mesh, m
@@ -128,7 +128,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
 
 
 def exceedance(shape: CoverShape, points: Array) -> Array:
-    """Return how far points lie outside a capsule or box; values are zero or negative inside. Shape (n,), m."""
+    """Return the distances by which points lie outside a capsule or box, zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
     own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
@@ -156,19 +156,19 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return volume, radius, ends, axis and a point of the axis of the capsule around points for given parameters.
+    """Return volume, radius, ends along the axis, axis and a point on the axis of the capsule with given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius.
     """
-    a, b, x, y, fat = parameters.tolist()
+    a, b, x, y, excess_root = parameters.tolist()
     length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
     axis = np.array([a, b, 1.0]) / length
     side = np.array([1.0, 0.0, -a]) / width
     other = np.array([-a * b, width * width, -b]) / (length * width)  # axis x side
     along = (axis[None] @ points.T)[0]
     across = ((side[None] @ points.T)[0] - x) ** 2 + ((other[None] @ points.T)[0] - y) ** 2
-    radius = math.sqrt(across.max()) * (1 + fat * fat)
+    radius = math.sqrt(across.max()) * (1 + excess_root * excess_root)
     caps = np.sqrt(np.maximum(radius * radius - across, 0))
     low, high = float((along + caps).min()), float((along - caps).max())
     if low > high:  # a ball encloses all points
@@ -178,9 +178,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
-    """Return parameters (as in `_evaluate_capsule`), basis and volume of a small capsule around points; bases (k, 3,
-    3).
-    """
+    """Return parameters, basis and volume of a small capsule around points; the bases to try have shape (k, 3, 3)."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -222,7 +220,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the two parts of a mesh, split by a plane, of least covered volume; the part itself if none splits it."""
+    """Return the parts into which a plane splits a mesh with least covered volume; one part if no plane splits it."""
     points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
@@ -245,9 +243,9 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
         return covered([_capsule_from_parameters(each, *_approximate_capsule(each, bases)[:2]) for each in points])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
-    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
+    levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.split_levels]
     share, k, level = min((share_of_split(k, level), k, level) for k, level in levels)
-    for fraction in (SETTINGS.cuts[0] / 2, SETTINGS.cuts[0] / 4):
+    for fraction in (SETTINGS.split_levels[0] / 2, SETTINGS.split_levels[0] / 4):
         step = fraction * spans[k][1]
         nearby = [(share_of_split(k, each), each) for each in (level - step, level + step)]
         share, level = min([(share, level), *nearby])
@@ -255,9 +253,7 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return points, (k, 3), spread evenly in a box that contains nearly all of the covers of given points, and its
-    volume.
-    """
+    """Return evenly spread points, (k, 3), in a box that contains nearly all covers of points, and its volume."""
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
@@ -274,7 +270,7 @@ def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
 
 
 def _representative_triangles(triangles: Array, frame: Array) -> Array:
-    """Return all triangles or, of many, the largest triangles and extreme vertices as degenerate triangles."""
+    """Return all triangles or, if they are many, the largest, and extreme vertices as degenerate triangles."""
     if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
@@ -304,9 +300,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points, with a face along a face of the hull and an edge along an
-    edge.
-    """
+    """Return a box of nearly least volume around points; a face and an edge lie along a face and edge of the hull."""
     frames = [_principal_axes(points)]
     try:
         hull = convex_hull(extreme_points)
@@ -396,7 +390,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return a shape of a mesh scaled to size 1 in the mesh's own units, enlarged by a bound of the rounding errors."""
+    """Convert a shape from coordinates scaled to mesh size 1 to mesh units; enlarge it by a rounding error bound."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)

@@ -1,8 +1,8 @@
 """Signed distance of two shapes as an expression, for constraints, performance indices and reports.
 
 The distance is exact for spheres, capsules, boxes and half-spaces: the distance of the closest points or, for
-overlapping shapes, minus the penetration depth. For meshes and cylinders it is a lower bound, the largest gap along
-the normals of their faces and along the bisectors of normals that meet at a sharp edge or corner.
+overlapping shapes, minus the penetration depth. For a `Polytope`, such as a mesh or a cylinder, it is a lower bound,
+the largest gap along the normals of its faces and along the bisectors of normals that meet at a sharp edge or corner.
 
 A shape is a convex core swept by a sphere. Separated cores have the distance d of their closest points. Overlapping
 cores have the largest gap along the candidate separating axes (face normals and cross products of edges), which is
@@ -43,12 +43,12 @@ from models.shapes.cores import (
     triple,
 )
 from models.shapes.hull import Hull
-from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, Shape, Sphere, checked_shape
+from models.shapes.shapes import Box, Capsule, HalfSpace, Polytope, Shape, Sphere, checked_shape
 from models.spatial import Expression, Frame, expression, on_scalars
 
 
 class HullCore(NamedTuple):
-    """A mesh or cylinder in distance formulas: a convex hull, with the centre and axes of its pose."""
+    """A `Polytope` in distance formulas: a convex hull, with the centre and axes of its pose."""
 
     centre: Triple
     axes: tuple[Triple, ...]
@@ -81,8 +81,8 @@ def distance(
     """Return the signed distance of two shapes, at poses that may be symbols, as an expression, m. Shape (1, 1).
 
     The distance is negative for overlapping shapes; its gradient points out of the overlap. Without rounding it is
-    exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its prism) beside a half-space.
-    Other pairs with a mesh or a cylinder get a lower bound, the largest gap along the normals of their faces.
+    exact for spheres, capsules, boxes and half-spaces, and for the hull of a `Polytope` beside a half-space. Any other
+    pair with a polytope, such as a mesh or a cylinder, gets a lower bound, the largest gap along the normals of faces.
 
     The exact distance of capsules and boxes has kinks, where second-order methods zigzag. With rounding e > 0 the
     result is a smooth lower bound on which an interior-point method converges. It minimises the squared distance over
@@ -91,7 +91,7 @@ def distance(
     minimum M lies in d^2..d^2 + c, so (M - c)/sqrt(M + c) is at most d and smooth.
 
     For capsules the bound is below the distance by at most 0.84 e, and by at most e^2/d for cores a distance d apart.
-    Beside a mesh, a cylinder or a half-space it is at most 3 e below the unrounded result, for two boxes at most 4 e
+    Beside a polytope or a half-space it is at most 3 e below the unrounded result, for two boxes at most 4 e
     below the largest of their gaps along 15 axes and of the distances of either one to the bounding box of the other in
     its own axes. A fifth of the radii is a good e and a hundredth has no effect. Spheres beside spheres, capsules and
     boxes are smooth already and ignore the rounding.
@@ -126,7 +126,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
 
     Raises:
-        ModelError: The shape is a mesh or a cylinder, which have no column, or is invalid for `distance`.
+        ModelError: The shape is a polytope, which has no column, or is invalid for `distance`.
     """
     checked_shape("column: shape", shape)
     _check_kind(type(shape), "shape")
@@ -149,7 +149,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
     often evaluates and compiles several times faster than one graph of all pairs.
 
     Raises:
-        ModelError: A kind is Mesh or Cylinder, both are HalfSpace, or the rounding is negative.
+        ModelError: A kind is a polytope, both are HalfSpace, or the rounding is negative.
     """
     for what, kind in (("first", first), ("second", second)):
         _check_kind(kind, what)
@@ -160,7 +160,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from n pairs of shapes to their distances and, as wrenches, the gradients of these.
+    """Return the CasADi Function from n pairs of shapes to their distances and the distances' gradients, as wrenches.
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
@@ -294,29 +294,28 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one a mesh or cylinder; `poses` are their rotations and positions."""
-    one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
-    if isinstance(one, PlaneCore):
-        gap = _least_height(other, one.normal, one.point, rounding)
-    elif isinstance(other, PlaneCore):
-        gap = _least_height(one, other.normal, other.point, rounding)
+    """Return the signed distance of two shapes, one a `Polytope`, at `poses` (rotation and position of each)."""
+    first_core, second_core = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
+    if isinstance(first_core, PlaneCore):
+        gap = _least_height(second_core, first_core.normal, first_core.point, rounding)
+    elif isinstance(second_core, PlaneCore):
+        gap = _least_height(first_core, second_core.normal, second_core.point, rounding)
     else:
-        gap = largest_of(
-            [*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, keep_gradient
-        )
+        gaps = [*_face_gaps(first_core, second_core, rounding), *_face_gaps(second_core, first_core, rounding)]
+        gap = largest_of(gaps, rounding, keep_gradient)
     return gap - (first.swept_radius + second.swept_radius)
 
 
 def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
     if type(shape) in COLUMNS:
         return _core_of_column(type(shape), list(map(_as_number, ca.vertsplit(column(shape, Frame(turn, place))))))
-    assert isinstance(shape, Mesh | Cylinder)
+    assert isinstance(shape, Polytope)
     axes = ca.horzsplit(ca.mtimes(turn, ca.DM(shape.rotation)))
     return HullCore(_scalars(place + ca.mtimes(turn, ca.DM(shape.position))), tuple(map(_scalars, axes)), shape.hull)
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the point, segment, box or plane of distance formulas from the column of numbers of a shape."""
+    """Convert the column of numbers of a shape to the point, segment, box or plane that distance formulas use."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -389,7 +388,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return a segment, box or hull of distance formulas in the coordinates of a frame with given centre and axes."""
+    """Transform a segment, box or hull of distance formulas to coordinates of a frame with given centre and axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

@@ -58,10 +58,10 @@ def join_meshes(parts: Sequence[Triangles]) -> Triangles:
     return Triangles(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), np.concatenate(colors))
 
 
-def mesh_error(file: Path, what: str, value: object = None, limit: object = None) -> ModelError:
-    """Return the ModelError about a mesh file; `what` describes the fault."""
+def mesh_error(file: Path, fault: str, value: object = None, limit: object = None) -> ModelError:
+    """Return the ModelError about a mesh file; `fault` states what is wrong."""
     bound = f", limit {limit}" if isinstance(limit, int) else ""
-    return ModelError(f"mesh {str(file)!r}: {what}{bound}", name=str(file), value=value, limit=limit)
+    return ModelError(f"mesh {str(file)!r}: {fault}{bound}", name=str(file), value=value, limit=limit)
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
@@ -238,7 +238,7 @@ def _merge_vertices(corners: Array) -> Triangles:
 
 
 def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first indices of the distinct rows of a table in ascending order, and for each row its distinct one.
+    """Return the index of each distinct row of a table, in ascending order of rows, and each row's number among them.
 
     Several times faster than `np.unique` with an axis.
     """
@@ -448,7 +448,7 @@ def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
     """
     root = ElementTree.Element("COLLADA")
     effects = {each.get("id"): each for each in document.iter("effect")}
-    libraries = [ElementTree.SubElement(root, f"library_{what}") for what in ("effects", "materials")]
+    libraries = [ElementTree.SubElement(root, f"library_{kind}") for kind in ("effects", "materials")]
     known = {each.get("id", ""): each for each in document.iter("material")}
     for k, (name, material) in enumerate(known.items()):
         instance = material.find("instance_effect")

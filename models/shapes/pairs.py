@@ -86,7 +86,7 @@ def checked_pairs(
     seed: int = 0,
     samples: int = 1000,
 ) -> Pairs:
-    """Return the pairs of a robot's bodies to check for collision: those that may collide but do not always.
+    """Return the pairs of a robot's bodies to check for collision: those that can collide but do not always collide.
 
     Not checked are:
 
@@ -252,8 +252,7 @@ class _PairClassifier:
     _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why two bodies need no collision check, or None; and whether covers of meshes always collide but hulls
-        do not.
+        """Return why two bodies need no check, or None; and whether only covers, not hulls, of meshes always collide.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -318,12 +317,10 @@ class _BodyPair:
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
             if largest <= 0:
                 return ALWAYS if overhang == 0 or largest < -overhang else COVERED
-        return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
+        return None if colliding.any() or not self._proves_separation(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER if two hulls are apart on ever finer grids of joint positions, ALWAYS if they overlap on the
-        first grid.
-        """
+        """Return NEVER if two hulls are disjoint on ever finer joint grids, ALWAYS if they overlap on the first."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         start = np.where(np.isfinite(low), low, -np.pi)[columns]
         end = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], start + 2 * np.pi)
@@ -342,8 +339,7 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of two bodies' distance at joint vectors (k, dof), m, and whether bounding balls were not
-        enough.
+        """Return lower bounds, m, of two bodies' distance at joint vectors (k, dof), and where balls do not suffice.
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """
@@ -355,7 +351,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds of two bodies' distance for poses of the second, exact if the search has converged, m."""
+        """Return lower bounds, m, of the distance for poses of the second body, exact if the search converges."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
@@ -375,7 +371,7 @@ class _BodyPair:
         back = first[0].transpose(0, 2, 1)
         return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]
 
-    def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
+    def _proves_separation(self, low: Array, high: Array, margin: float) -> bool:
         """Return whether bisection of the joint space proves that two bodies stay farther apart than `margin`, m."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
@@ -416,7 +412,7 @@ class _BodyPair:
         return False
 
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
-        """Return the joints between two bodies with their lever arms, the shorter of those to both bodies."""
+        """Return the joints between two bodies, each with the shorter of its lever arms to the two bodies."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
         arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)
@@ -434,7 +430,7 @@ def _grid(values: Array, dimension: int) -> Array:
 
 
 def _poses_below(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
-    """Return the poses of the rigid part below a joint from those of the part above it, at joint vectors q."""
+    """Return the poses of the rigid part below a joint, given the poses of the part above it, at joint vectors q."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset
     shift = shift + turn @ step.translation

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias, get_args
 
 import casadi as ca
 import numpy as np
@@ -64,8 +64,8 @@ class _SweptCore:
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
 
 
-class _Polytope(_SweptCore):
-    """A convex polytope at a pose of its own, given by its hull."""
+class Polytope(_SweptCore):
+    """A shape that distances represent by its `hull`, a convex polytope at a pose of its own."""
 
     AXES: ClassVar[tuple[str, ...]] = ("rotation",)
     position: ArrayInput
@@ -135,7 +135,7 @@ class Capsule(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_Polytope):
+class Cylinder(Polytope):
     """A solid cylinder about its own z axis.
 
     Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
@@ -246,7 +246,7 @@ class HalfSpace(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(_Polytope):
+class Mesh(Polytope):
     """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
@@ -313,13 +313,13 @@ class Mesh(_Polytope):
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
 
-KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
+SHAPE_KINDS: tuple[type[Shape], ...] = get_args(Shape)
 
 
 def checked_shape(label: str, value: Any) -> Shape:
     """Return the value after checking that it is a shape, such as a Box; raise ModelError otherwise."""
-    if not isinstance(value, KINDS):
-        names = ", ".join(kind.__name__ for kind in KINDS)
+    if not isinstance(value, SHAPE_KINDS):
+        names = ", ".join(kind.__name__ for kind in SHAPE_KINDS)
         raise require.invalid(label, f"a shape ({names})", value, names)
     return value
 

@@ -163,7 +163,7 @@ def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 
 def _names(text: str | None) -> list[str] | None:
-    """Return the names in a list that commas separate; None without a list."""
+    """Return the names in a comma-separated list; None if there is no list."""
     return None if text is None else [name.strip() for name in text.split(",")]
 
 

@@ -54,6 +54,10 @@ class AccessoryProblem:
         self.free, self.with_start = form.horizon_is_free, form.ties_ends
         self.nz = self.nx * (1 + self.with_start) + self.free
         self.obstacle = str(form.cached("obstacle", lambda: obstacle(form)))
+        # indices of states, free horizon T and controls in the stacked vectors (x, T, u) and (z, u)
+        states = [*range(self.nx), *([self.nx] if self.free else [])]
+        self._used = [*states, *range(self.nx + 1, self.nx + 1 + self.nu)]
+        self._z_of = [*range(len(states)), *range(self.nz, self.nz + self.nu)]
         self._second_order()
         self._constraints()
         self._switches()
@@ -80,16 +84,6 @@ class AccessoryProblem:
         share_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
-    def _variation_indices(self) -> tuple[list[int], list[int]]:
-        """Return the indices of states, free horizon T and controls in the stacked vectors (x, T, u) and (z, u).
-
-        z consists of the states, T if free, and the start state if the problem ties both ends.
-        """
-        nx = self.nx
-        keep = [*range(nx), *([nx] if self.free else [])]
-        inputs = range(nx + 1, nx + 1 + self.nu)
-        return [*keep, *inputs], [*range(len(keep)), *range(self.nz, self.nz + self.nu)]
-
     def _second_order(self) -> None:
         """Compute first and second derivatives of dynamics and Hamiltonian with respect to scaled variations."""
         along, form, m = self.along, self.along.form, len(self.along.s)
@@ -110,7 +104,7 @@ class AccessoryProblem:
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
         self._curves = np.einsum("kii->ki", hessian)
         self._units()
-        used, z_of = self._variation_indices()
+        used, z_of = self._used, self._z_of
         size, z_unit = self.nz + self.nu, self.unit[: self.nz]
         self.rate, self.hessian = np.zeros((m, self.nz, size)), np.zeros((m, size, size))
         self.rate[np.ix_(range(m), range(self.nx), z_of)] = along.rate_y[:, :, used]
@@ -169,7 +163,7 @@ class AccessoryProblem:
     def _constraints(self) -> None:
         """Find the strongly active limits, which have multipliers, and the weakly active limits, which have none."""
         along, m = self.along, len(self.along.s)
-        used, z_of = self._variation_indices()
+        used, z_of = self._used, self._z_of
         size = self.nz + self.nu
         nu, nh = self.nu, self.nu + along.mixed.size
         normals = np.zeros((m, nh + len(along.state_limits.equal), size))

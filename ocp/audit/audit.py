@@ -16,7 +16,7 @@ from ocp.audit.clearance import Clearance, clearance
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
 from ocp.audit.reintegration import Reintegration, Violation, reintegrate, violations
-from ocp.audit.sizes import Sizes, fine_grid, sizes_along
+from ocp.audit.sizes import Sizes
 from ocp.console import check_time, interruptible
 from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, require
@@ -234,24 +234,20 @@ def audit(
     check_structure(solution)
     check_variables_match(form, solution)
     solution = match_order(form, solution)
-    p = form.parameter_vector(solution.parameters)
-    bounds = form.bound_values(p)
-    grid = fine_grid(solution)
-    size = sizes_along(form, grid, solution.horizon, p=p, bounds=bounds)
-    along = Linearisation(form, solution, p, bounds, sizes=size)
-    motion = reintegrate(along, grid)
+    along = Linearisation(form, solution)
+    p, grid, size, motion = along.p, along.grid, along.sizes, reintegrate(along)
     check_time()
 
     findings = []
     is_unstable = motion.is_unstable(integration)
     findings.append(integration_finding(motion, integration, is_unstable))
-    findings.append(_worst("integration error of one interval", motion.local_errors, motion.t, integration))
+    findings.append(_worst("integration error of one interval", motion.local_errors, grid.t, integration))
     judged_states, running = (motion.local, motion.local_cost) if is_unstable else (motion.states, motion.cost)
-    final = form.terminal_cost(judged_states[-1], judged_states[0], motion.controls[0], horizon=solution.horizon, p=p)
+    final = form.terminal_cost(judged_states[-1], judged_states[0], grid.controls[0], horizon=solution.horizon, p=p)
     cost = _cost_finding(solution, running, final, size, integration)
     findings.append(cost)
     findings.append(reported_finding(solution, size, integration))
-    findings.append(horizon_finding(form, solution, bounds))
+    findings.append(horizon_finding(form, solution, along.bounds))
 
     rows = (form.path, form.start, form.end, form.watch)
     names = [*form.states, *form.controls, *form.separations, *[name for kind in rows for name in kind.names]]
@@ -277,7 +273,7 @@ def audit(
         undecided = f"the solver says {solution.message or solution.status}"
     if not (only_feasible or solution.has_no_multipliers):
         # an infeasible plan does not need the best multipliers
-        optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
+        optimum = optimality(along, lost if is_sound else np.inf)
         excess = cost.value if cost.passed and solution.cost > running + final else 0.0
         findings += optimality_findings(form, optimum, excess, lost, costates=costates)
         undecided = undecided if not solution.success else optimum.curvature.flat
@@ -288,9 +284,9 @@ def audit(
         constraint_values,
         float(np.max(motion.errors)),
         motion.local_errors.reshape(-1, grid.samples).max(axis=1),
-        motion.t,
+        grid.t,
         unstack(solution.states, motion.states),
-        unstack(solution.controls, motion.controls),
+        unstack(solution.controls, grid.controls),
         clearances,
         optimum,
     )
@@ -358,7 +354,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
     effective_limit = None if is_unstable else limit
-    return _worst("integration error, relative", motion.errors, motion.t, effective_limit, "; ".join(notes))
+    return _worst("integration error, relative", motion.errors, motion.grid.t, effective_limit, "; ".join(notes))
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:

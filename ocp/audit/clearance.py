@@ -268,7 +268,8 @@ class _Search:
         self.top = max(0, int(np.ceil(np.log2(self.pieces / self.settings.first_blocks))))
         self.fastest = [(track.rates, track.seconds)]
         for level in range(self.top):
-            rates, seconds = (_pairwise_maximum(values) for values in self.fastest[level])
+            pairs = np.arange(0, len(self.fastest[level][0]), 2)
+            rates, seconds = (np.maximum.reduceat(values, pairs) for values in self.fastest[level])
             self.fastest.append((rates, seconds if track.smooth else np.full_like(seconds, np.inf)))
         self.bodies = BodyPairs(apart.bodies, apart.pairs, apart.covers)
         n = len(apart)
@@ -430,12 +431,6 @@ class _Search:
         first = first[distance[first] < self.best[pair[first]]]
         i = pair[first]
         self.best[i], self.when[i], self.points[i] = distance[first], at[first], points[first]
-
-
-def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
-    """Return the maximum of every two successive rows of an array; a single last row stays. Shape (ceil(N / 2), k)."""
-    even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
-    return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
 def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Linearisation, quadrature
-from ocp.audit.sizes import FineGrid, plan_at
+from ocp.audit.sizes import plan_at
 from ocp.console import check_time
 from ocp.curves import lagrange
 
@@ -84,11 +84,11 @@ class IntegratedMotion(NamedTuple):
     cost: float
 
 
-def corrected_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion | None:
+def corrected_motion(along: Linearisation) -> IntegratedMotion | None:
     """Return the motion that the controls of a plan produce; None if the corrections of its states do not converge."""
     if not along.finite:
         return None
-    newton = _Newton(along, grid)
+    newton = _Newton(along)
     continuous = newton.converged(True)
     if continuous is None:
         return None
@@ -109,8 +109,8 @@ class _Converged(NamedTuple):
 class _Newton:
     """Newton's method for the motion that the controls of a plan produce, on the fine grid of the plan."""
 
-    def __init__(self, along: Linearisation, grid: FineGrid) -> None:
-        self.along, form = along, along.form
+    def __init__(self, along: Linearisation) -> None:
+        self.along, form, grid = along, along.form, along.grid
         (n, q), nx, cells = along.shape, form.nx, grid.samples - 1
         self.width = along.width[:, None, None]
         panels = cells // len(INNER)

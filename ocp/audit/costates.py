@@ -108,16 +108,14 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         control_multipliers, across = find_control_multipliers(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (control_multipliers != 0)).all():
             break
-    size = along.state_size
-    share, charge = along.share.reshape(n, q, 1), along.state_limits.charge(inside.reshape(n * q, m)).reshape(n, q, m)
-    node = along.node_limits
-    atom_charges = [node.at(k).charge(atoms[:, e]).sum(axis=1) for e, k in ((0, slice(0, n)), (1, slice(1, n + 1)))]
+    size, share = along.state_size, along.share.reshape(n, q, 1)
+    charge = along.state_limits.charge(inside.reshape(n * q, m)).reshape(n, -1).sum(axis=1)
+    charge += along.node_limits.at(along.interval_ends).charge(atoms).sum(axis=(1, 2))
     state_multipliers = inside / share
-    state_multipliers[:, 0] += atoms[:, 0] / share[:, 0]
-    state_multipliers[:, -1] += atoms[:, 1] / share[:, -1]
-    force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.state_limits_x[..., :-1].reshape(n, q, m, -1))) @ size
-    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_limits_x[nodes, :, :-1])) @ size
+    state_multipliers[:, [0, -1]] += atoms / share[:, [0, -1]]
+    force = np.einsum("kjm,kjmi->kji", inside, along.state_limits_x[..., :-1].reshape(n, q, m, -1))
+    atom_force = np.einsum("kjm,kjmi->kji", atoms, along.node_limits_x[along.interval_ends, :, :-1])
+    explained = (np.abs(np.concatenate([force, atom_force], axis=1)) @ size).sum(axis=1)
     propagated = back.accumulate(first - start)
     total = min(float(np.abs(first - start).sum(axis=0) @ size), float((np.abs(propagated) @ size).max()))
     return Adjoint(
@@ -127,8 +125,8 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         state_multipliers.reshape(n * q, m),
         np.abs(first - start) @ size,
         total,
-        np.maximum(_inside_errors(along, costate, last) - force.sum(axis=1), 0.0),
-        charge.sum(axis=(1, 2)) + atom_charges[0] + atom_charges[1],
+        np.maximum(_inside_errors(along, costate, last) - explained, 0.0),
+        charge,
         _node_shifts(along, control_multipliers, inside, atoms if shifts is None else None),
         _ends(along, costate, control_multipliers, inside, atoms, cost, last[-1]),
     )
@@ -241,55 +239,48 @@ def _state_limit_multipliers(
 
     Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
     """
-    along = back.along
-    q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
-    points = slice(k * q, (k + 1) * q)
-    size, unit = along.state_size, along.control_size
-    limits = [along.state_limits.at(points), along.node_limits.at(slice(k, k + 2))]
-    slopes = [along.state_limits_x[points, :, :nx], along.node_limits_x[k : k + 2, :, :nx]]
-    columns, charges, sources, free = [], [], [], []
-    for kind, (limit, slope_x) in enumerate(zip(limits, slopes, strict=True)):
-        for side, gap, sign in ((limit.upper, limit.above, 1.0), (limit.lower & ~limit.equal, limit.below, -1.0)):
-            for j, i in zip(*np.nonzero(side), strict=True):
+    along, (q, nx) = back.along, (back.along.shape[1], back.along.form.nx)
+    points, size, unit, weight = slice(k * q, (k + 1) * q), along.state_size, along.control_size, along.weight
+    inside, atoms = np.zeros((q, len(along.state_limits.equal))), np.zeros((2, len(along.state_limits.equal)))
+    kinds = (
+        (inside, along.state_limits.at(points), along.state_limits_x[points, :, :nx]),
+        (atoms, along.node_limits.at(slice(k, k + 2)), along.node_limits_x[k : k + 2, :, :nx]),
+    )
+    # density of each multiplier: that at a Gauss point, at the end, or at the start of the interval
+    densities = back.ahead.T / weight[:, None], np.array([np.zeros(q), np.ones(q)])
+    places, directions, shares, prices, free = [], [], [], [], []
+    for (values, limit, slope_x), density in zip(kinds, densities, strict=True):
+        is_atom = values is atoms
+        for active, gap, sign in limit.sides:
+            for j, i in np.argwhere(active).tolist():
                 effect = float(np.abs(slope_x[j, i]) @ size)
                 # one unknown per equality, where the transcription imposes it
-                redundant = limit.equal[i] and (kind, j) != (1, 0) if along.nodal else limit.equal[i] and kind == 1
+                redundant = limit.equal[i] and (is_atom, j) != (True, 0) if along.nodal else limit.equal[i] and is_atom
                 if effect > 0 and not redundant:
-                    columns.append((kind, j, sign * slope_x[j, i] / effect))
-                    charges.append(gap[j, i] / effect)
-                    sources.append((kind, j, i, sign / effect))
+                    places.append((values, j, i, sign / effect))
+                    directions.append(sign * slope_x[j, i] / effect)
+                    shares.append(density[j])
+                    prices.append(gap[j, i] / effect)
                     free.append(bool(limit.equal[i]))
-    inside, atoms = np.zeros((q, m)), np.zeros((2, m))
-    if not columns:
+    if not places:
         return inside, atoms
-    # responses of the costates at the Gauss points and at the start to each multiplier
-    responses, start = np.zeros((len(columns), q, nx)), np.zeros((len(columns), nx))
-    for c, (kind, j, direction) in enumerate(columns):
-        if kind == 0:
-            responses[c] = back.ahead[:, j, None] / along.weight[j] * direction
-            start[c] = direction
-        elif j == 1:
-            responses[c], start[c] = direction, direction
-        else:
-            start[c] = direction
-    responses = (responses.reshape(len(columns), -1) @ back.inverse[k].T).reshape(-1, q, nx)
-    flow = np.einsum("jab,cjb->cja", back.feed[k], responses)
-    start += along.width[k] * np.einsum("j,cja->ca", along.weight, flow)
-    known = last + back.drive[k]
-    base = (back.inverse[k] @ known.ravel()).reshape(q, nx)
-    flow0 = np.einsum("jab,jb->ja", back.feed[k], base) + back.source[k]
-    start0 = last + along.width[k] * along.weight @ flow0
-    weight = along.width[k] * along.weight
-    rate_u = along.rate_y[points, :, nx + 1 :]
-    gradient = along.cost_y[points, nx + 1 :] + np.einsum("jiu,ji->ju", rate_u, base)
-    projectors = back.projector[points]
-    slope0 = np.einsum("j,juv,jv->ju", weight, projectors, unit * gradient)
-    slopes_c = np.einsum("j,juv,cjv->cju", weight, projectors, unit * np.einsum("jiu,cji->cju", rate_u, responses))
-    target = np.concatenate([(first - start0) * size, -slope0.ravel()]) / cost
-    matrix = np.hstack([start * size, slopes_c.reshape(len(columns), q * len(unit))]).T
-    values = nnls(matrix, target, COSTATE_SHARE * np.array(charges), np.array(free, bool)) * cost
-    for (kind, j, i, scale), value in zip(sources, values, strict=True):
-        (inside if kind == 0 else atoms)[j, i] += scale * value
+    # costates at the Gauss points and at the start without multipliers, and their response to each multiplier
+    ends = np.vstack([last, directions])
+    known = np.concatenate([(last + back.drive[k])[None], np.array(shares)[:, :, None] * ends[1:, None]])
+    costates = (known.reshape(len(ends), -1) @ back.inverse[k].T).reshape(known.shape)
+    flow = np.einsum("jab,cjb->cja", back.feed[k], costates)
+    flow[0] += back.source[k]
+    starts = ends + along.width[k] * np.einsum("j,cja->ca", weight, flow)
+    gradients = np.einsum("jiu,cji->cju", along.rate_y[points, :, nx + 1 :], costates)
+    gradients[0] += along.cost_y[points, nx + 1 :]
+    projectors = (along.width[k] * weight)[:, None, None] * back.projector[points]
+    slopes = np.einsum("juv,cjv->cju", projectors, unit * gradients)
+    errors = np.hstack([starts * size, slopes.reshape(len(ends), -1)])
+    errors[0, :nx] -= first * size
+    charges = COSTATE_SHARE * np.array(prices)
+    multipliers = nnls(errors[1:].T, -errors[0] / cost, charges, np.array(free, bool)) * cost
+    for (values, j, i, scale), multiplier in zip(places, multipliers, strict=True):
+        values[j, i] += scale * multiplier
     return inside, atoms
 
 
@@ -318,9 +309,7 @@ def _ends(
     lam1: np.ndarray,
 ) -> Ends:
     """Return the residuals of the optimality conditions at both ends, with fitted multipliers of admissible sign."""
-    form, solution, nx = along.form, along.solution, along.form.nx
-    low, high = along.bounds
-    places = form.bounds.places
+    form, nx = along.form, along.form.nx
     lam0 = interval_end_costates(along)[0][0]
     gradient = along.final_y
     # dT H/dT along the plan, with the state limits
@@ -329,29 +318,19 @@ def _ends(
         "km,km->k", along.row_y[:, along.mixed, nx], control_multipliers[:, form.nu : form.nu + along.mixed.size]
     )
     horizon_slope = float(along.share @ by_horizon)
-    n, q = along.shape
-    horizon_slope += float(np.sum(inside.reshape(n * q, -1) * along.state_limits_x[:, :, nx]))
-    for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
-        horizon_slope += float(np.sum(atoms[:, e] * along.node_limits_x[nodes, :, nx]))
+    horizon_slope += float(np.sum(inside.reshape(len(along.s), -1) * along.state_limits_x[:, :, nx]))
+    horizon_slope += float(np.sum(atoms * along.node_limits_x[along.interval_ends, :, nx]))
     target = np.concatenate([lam1 - gradient[:nx], -lam0 - gradient[nx : 2 * nx], [-horizon_slope - gradient[-1]]])
-    unit = np.concatenate([along.state_size, along.state_size, [solution.horizon]])
-
     limits = end_limits(along)
-    effect = np.abs(limits.slope) @ unit
-    free = np.ones(2 * nx + 1, bool)
-    free[:nx] = low[places["terminal"]] < high[places["terminal"]]
-    free[nx : 2 * nx] = low[places["initial"]] < high[places["initial"]]
-    free[-1] = form.horizon_is_free
-    matrix = (limits.slope * (limits.sign / effect)[:, None] * unit).T[free]
-    prices = COSTATE_SHARE * limits.gap / effect
-    values = nnls(matrix, (target * unit)[free] / cost, prices, limits.equal) * cost
+    free, price = limits.free, limits.gap / limits.reach
+    target = (target * limits.unit)[free]
+    matrix = limits.scaled_slope.T[free]
+    values = nnls(matrix, target / cost, COSTATE_SHARE * price, limits.equal) * cost
     residual = np.zeros(2 * nx + 1)
-    residual[free] = (target * unit)[free] - matrix @ values
-    charge = float(limits.gap / effect @ values)
-    multipliers = limits.table(values / effect)
-    errors = np.abs(residual)
-    slope = residual[nx:] / unit[nx:]
-    return Ends(float(errors[:-1].sum()), float(errors[-1]), slope, charge, *multipliers)
+    residual[free] = target - matrix @ values
+    errors, slope = np.abs(residual), residual[nx:] / limits.unit[nx:]
+    table = limits.table(values / limits.reach)
+    return Ends(float(errors[:-1].sum()), float(errors[-1]), slope, float(price @ values), *table)
 
 
 @dataclass(frozen=True)
@@ -366,6 +345,8 @@ class EndLimits:
         equal: Whether it is an equality; these are listed once. Shape (K,).
         row: Index among the rows of end and start constraints, in this order, or -1. Shape (K,).
         rows: Numbers of rows of end and start constraints.
+        free: Which entries of x, x0 and T are not fixed by their bounds. Shape (2 nx + 1,), bool.
+        unit: Sizes of x, x0 and T. Shape (2 nx + 1,).
     """
 
     slope: np.ndarray
@@ -374,6 +355,18 @@ class EndLimits:
     equal: np.ndarray
     row: np.ndarray
     rows: tuple[int, int]
+    free: np.ndarray
+    unit: np.ndarray
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Effect of a multiplier of one, in units of cost. Shape (K,)."""
+        return np.asarray(np.abs(self.slope) @ self.unit)
+
+    @property
+    def scaled_slope(self) -> np.ndarray:
+        """Effect of a multiplier on the slope of the cost in each scaled entry, over its reach. Shape (K, 2 nx + 1)."""
+        return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the signed multipliers of the end constraints and of the start constraints."""
@@ -390,13 +383,11 @@ def end_limits(along: Linearisation) -> EndLimits:
     equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])
     size = np.concatenate([sizes.end, sizes.start])
     horizon, place = along.solution.horizon, form.bounds.places["horizon"]
-    horizon_limits = Limits(
-        np.array([[horizon]]), low[place], high[place], low[place] == high[place], size=np.array([horizon])
-    )
+    own, value = (low[place], high[place], low[place] == high[place]), np.array([horizon])
     parts = [
-        (Limits(along.end_row[None], low[index], high[index], equal, size=size), along.end_y, np.arange(len(index)))
+        (Limits(along.end_row[None], low[index], high[index], equal, size=size), along.end_y, np.arange(len(index))),
+        (Limits(value[None], *own, size=value), np.eye(2 * nx + 1)[-1:], np.array([-1])),
     ]
-    parts.append((horizon_limits, np.eye(2 * nx + 1)[-1:], np.array([-1])))
     for k, entries in ((-1, [*range(nx), 2 * nx]), (0, [*range(nx, 2 * nx), 2 * nx])):
         slope = np.zeros((along.node_limits_x.shape[1], 2 * nx + 1))
         slope[:, entries] = along.node_limits_x[k]
@@ -405,11 +396,12 @@ def end_limits(along: Linearisation) -> EndLimits:
     sides: list[tuple[np.ndarray, ...]] = []
     for limits, slope, row in parts:
         has_slope = np.abs(slope).max(axis=1, initial=0.0) > 0
-        for active, gap, sign in (
-            (limits.upper[0], limits.above[0], 1.0),
-            (limits.lower[0] & ~limits.equal, limits.below[0], -1.0),
-        ):
-            near = active & has_slope
-            sides.append((slope[near], np.full(int(near.sum()), sign), gap[near], limits.equal[near], row[near]))
+        for active, gap, sign in limits.sides:
+            near = active[0] & has_slope
+            sides.append((slope[near], np.full(int(near.sum()), sign), gap[0, near], limits.equal[near], row[near]))
     slopes, signs, gaps, equals, rows = (np.concatenate(part) for part in zip(*sides, strict=True))
-    return EndLimits(slopes, signs, gaps, equals, rows, (len(form.end), len(form.start)))
+    places = form.bounds.places
+    fixed = [low[places[kind]] == high[places[kind]] for kind in ("terminal", "initial")]
+    free = ~np.concatenate([*fixed, [not form.horizon_is_free]])
+    unit = np.concatenate([along.state_size, along.state_size, [horizon]])
+    return EndLimits(slopes, signs, gaps, equals, rows, (len(form.end), len(form.start)), free, unit)

@@ -9,7 +9,7 @@ cost. The sweep is linear in the number of intervals.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +54,7 @@ class Curvature:
             active and the states respond. Shape (N,).
         start_slope: Remaining gradient of the cost with respect to start and horizon. Shape (nz,).
         proof: Why an extremal is a global optimum whatever the sweep finds, or "".
+        dependent: Whether the sweep is inconclusive because constraints are nearly dependent.
     """
 
     least: float
@@ -65,6 +66,7 @@ class Curvature:
     gain: np.ndarray | None = None
     start_slope: np.ndarray | None = None
     proof: str = ""
+    dependent: bool = False
 
     @property
     def upwards(self) -> bool | None:
@@ -97,73 +99,42 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
     if accessory.obstacle:
         return Curvature(np.nan, None, accessory.obstacle, None, along.t)
     stages = _Linearised.of(accessory)
-    result = _sweep(accessory, stages, weak=False)
+    result = _sweep(accessory, stages)
     if result.least <= FLAT_SHARE and accessory.weak.any():
         # an active limit without a multiplier blocks only one side of a direction
-        inside = _sweep(accessory, stages, weak=True)
-        if inside.least > FLAT_SHARE:
+        result = _sweep(accessory, stages, weak=True)
+        if result.least > FLAT_SHARE:
             reason = "the cost curves upwards only because of active limits without multipliers"
-            return Curvature(inside.least, inside.time, reason, None, along.t, *inside[4:7])
-        result = inside
+            return replace(result, flat=reason)
     if result.dependent:
         # The controls affect implied conditions only by the error of the plan: pass these on to earlier stages, or drop
         # their remainders. This frees more variations, so that an upward curvature remains conclusive.
         for tolerances in (RankTolerances(SOLVER_SHARE, SOLVER_SHARE), RankTolerances(IMPLIED_SHARE, ROUNDING_SHARE)):
-            wider = _sweep(accessory, stages, weak=False, tolerances=tolerances)
+            wider = _sweep(accessory, stages, tolerances)
             if wider.least > FLAT_SHARE and not wider.flat:
                 result = wider
                 break
     if result.flat and (proof := global_optimum(along, accessory.negligible_cost)):
-        return Curvature(result.least, result.time, "", None, along.t, *result[4:7], proof)
-    flat = result.flat
-    if flat:
-        flat += describe_singular_arcs(along, accessory.adjoint.costate, accessory.linear_controls, accessory.moved)
-    return Curvature(result.least, result.time, flat, result.direction, along.t, *result[4:7])
-
-
-class _Swept(NamedTuple):
-    """Result of one backward sweep of the second variation, with the fields of `Curvature` except for the times.
-
-    ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
-    """
-
-    least: float
-    time: float | None
-    flat: str
-    direction: tuple[np.ndarray, np.ndarray] | None
-    starts: tuple[np.ndarray, np.ndarray] | None = None
-    gain: np.ndarray | None = None
-    start_slope: np.ndarray | None = None
-    dependent: bool = False
+        return replace(result, flat="", proof=proof)
+    if result.flat:
+        arcs = describe_singular_arcs(along, accessory.adjoint.costate, accessory.linear_controls, accessory.moved)
+        return replace(result, flat=result.flat + arcs)
+    return result
 
 
 def _sweep(
-    accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
-) -> _Swept:
-    """Sweep backwards over all stages (mesh intervals), by linear solves if all are convex, else by eigenvectors.
-
-    Args:
-        weak: Whether active limits without multipliers must stay active too.
-        tolerances: Which constraints count as dependent.
-    """
-    reduced = _reduce_stages(accessory, stages, weak, tolerances)
-    if not accessory.linear_controls.any():
-        sweep = _sweep_stages(accessory, stages, reduced, tolerances, upwards=True)
-        if sweep is not None:
-            return sweep
-    sweep = _sweep_stages(accessory, stages, reduced, tolerances, upwards=False)
-    assert sweep is not None
-    return sweep
-
-
-def _sweep_stages(
-    accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tolerances: RankTolerances, upwards: bool
-) -> _Swept | None:
-    """Sweep backwards over all stages (mesh intervals); with ``upwards``, return None if a stage is not convex.
+    accessory: AccessoryProblem, sweep: _Linearised, tolerances: RankTolerances = FULL_RANK, weak: bool = False
+) -> Curvature:
+    """Sweep backwards over all stages (mesh intervals).
 
     Cost, step and curvature of a stage refer to (z, 1, controls), so that they include the slope of the cost.
+
+    Args:
+        tolerances: Which constraints count as dependent.
+        weak: Whether active limits without multipliers must stay active too.
     """
-    mesh, horizon = accessory.along.mesh, accessory.along.solution.horizon
+    stages = _reduce_stages(accessory, sweep, weak, tolerances)
+    mesh, horizon, t = accessory.along.mesh, accessory.along.solution.horizon, accessory.along.t
     n, nz, nu = accessory.along.shape[0], accessory.nz, accessory.nu
     m, rows, scale = nz + 1, _unit_end_rows(sweep.end_rows), sweep.scale
     cost = np.zeros((m, m))
@@ -171,7 +142,6 @@ def _sweep_stages(
     least, time, inconclusive = np.inf, None, ""
     gains: list[_Gain] = []
     gain = np.zeros(n)
-    curved_stages: dict[int, list[tuple[int, np.ndarray]]] = {}  # stages and their Hessians, by size
     for k in reversed(range(n)):
         lift, move, stage_cost, remaining = stages[k]
         total = stage_cost + move.T @ (cost @ move)
@@ -184,41 +154,26 @@ def _sweep_stages(
         stage_hessian, mixed, cost = total[m:, m:], total[m:, :m], total[:m, :m]
         response = mixed
         if len(stage_hessian):
-            if upwards:
-                curved_stages.setdefault(len(stage_hessian), []).append((k, stage_hessian))
-                try:
-                    response = np.linalg.solve(stage_hessian, mixed)
-                except np.linalg.LinAlgError:
-                    return None
+            smallest = float(np.linalg.eigvalsh(stage_hessian)[0])
+            if smallest / scale < least:
+                least, time = smallest / scale, float(mesh[k] * horizon)
+            if smallest > FLAT_SHARE * scale:
+                response = np.linalg.solve(stage_hessian, mixed)
             else:
                 values, vectors = np.linalg.eigh(stage_hessian)
-                if values[0] / scale < least:
-                    least, time = float(values[0] / scale), float(mesh[k] * horizon)
-                if values[0] < -FLAT_SHARE * scale:
-                    worst = lift[m:, m:] @ vectors[:, 0]
-                    reason = _singular(accessory, k, worst)
-                    if reason:
-                        return _Swept(least, time, reason, None)
-                    return _confirm_negative(least, time, _variation(accessory, sweep, k, worst, gains), scale)
-                curved = values > FLAT_SHARE * scale
-                if not curved.all() and not inconclusive:
-                    label = _label(accessory.along.form, lift[m:, m:] @ vectors[:, 0], nu)
-                    inconclusive = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
+                worst = lift[m:, m:] @ vectors[:, 0]
+                if smallest < -FLAT_SHARE * scale:
+                    if reason := _singular(accessory, k, worst):
+                        return Curvature(least, time, reason, None, t)
+                    return _negative(accessory, sweep, gains, (least, time), first=k, controls=worst)
+                label = _label(accessory.along.form, worst, nu)
+                flat = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
+                inconclusive, curved = inconclusive or flat, values > FLAT_SHARE * scale
                 response = (vectors[:, curved] / values[curved]) @ (vectors[:, curved].T @ mixed)
             gain[k] = mixed[:, nz] @ response[:, nz] / 2
             cost = cost - mixed.T @ response
         cost = (cost + cost.T) / 2
         gains.append(_Gain(lift[m:], response))
-    for curves in curved_stages.values():
-        hessians = np.array([stage_hessian for _, stage_hessian in curves])
-        if not np.isfinite(hessians).all():  # stages before one that is not convex
-            return None
-        smallest = np.linalg.eigvalsh(hessians)[:, 0] / scale
-        i = int(np.argmin(smallest))
-        if not smallest[i] > FLAT_SHARE:
-            return None
-        if smallest[i] < least:
-            least, time = float(smallest[i]), float(mesh[curves[i][0]] * horizon)
     start_rows = _unit_end_rows(sweep.start_rows)
     _, sizes, right = np.linalg.svd(unit_rows(np.vstack([rows, start_rows]), tolerances.size))
     basis = right[int(np.sum(sizes > tolerances.size)) :].T
@@ -228,12 +183,11 @@ def _sweep_stages(
         if values[0] / scale < least:
             least, time = float(values[0] / scale), 0.0
         if values[0] < -FLAT_SHARE * scale:
-            variation = _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0])
-            return _confirm_negative(least, time, variation, scale)
+            return _negative(accessory, sweep, gains, (least, time), start=basis @ vectors[:, 0])
         if values[0] <= FLAT_SHARE * scale:
             inconclusive = inconclusive or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT_SHARE * scale, values, 0.0)
-    return _Swept(least, time, inconclusive, None, starts, gain, cost[:nz, nz])
+    return Curvature(least, time, inconclusive, None, t, starts, gain, cost[:nz, nz])
 
 
 class _Linearised(NamedTuple):
@@ -403,30 +357,28 @@ def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
-class _Variation(NamedTuple):
-    """Variation of the controls and states of a plan, and its effect on the cost and on the constraints.
-
-    Attributes:
-        curvature: Twice the second variation of the cost per squared length of the control variation.
-        slip: Largest violation of the linearised constraints, relative to the largest entry.
-    """
-
-    controls: np.ndarray
-    states: np.ndarray
-    curvature: float
-    slip: float
-
-
-def _variation(
+def _negative(
     accessory: AccessoryProblem,
     sweep: _Linearised,
-    first: int,
-    controls: np.ndarray | None,
     gains: list[_Gain],
+    curvature: tuple[float, float | None],
+    *,
+    first: int = 0,
+    controls: np.ndarray | None = None,
     start: np.ndarray | None = None,
-) -> _Variation:
-    """Return the variation that begins with given controls or a given start and follows the optimal feedback."""
-    along, nz, nu = accessory.along, accessory.nz, accessory.nu
+) -> Curvature:
+    """Return the result of a sweep with negative curvature, which counts only if an admissible variation confirms it.
+
+    End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
+    freedom.
+
+    Args:
+        gains: Optimal feedback of the stages from the last one on; the variation follows it.
+        curvature: Smallest curvature, and its time.
+        first: Stage in which the variation begins.
+        controls: Variation of the controls of this stage; None if the variation begins with a variation ``start``.
+    """
+    along, nz, nu, least, time = accessory.along, accessory.nz, accessory.nu, *curvature
     n, q = along.shape
     without_one = np.delete(np.arange(nz + 1 + q * nu), nz)
     step, stage = sweep.step[:, :nz, without_one], sweep.stage[:, without_one][:, :, without_one]
@@ -447,20 +399,11 @@ def _variation(
     violations.append(np.abs(sweep.end_rows @ z).max(initial=0.0))
     size = max(float(np.abs(states).max()), float(np.abs(values).max(initial=0.0)))
     length = float(np.sum(values**2) + (0.0 if start is None else start @ start))
-    values /= np.repeat(sweep.metric, nu, axis=1)
-    unscaled = values.reshape(n * q, nu) * accessory.range, states[:, : accessory.nx] * accessory.unit[: accessory.nx]
-    return _Variation(*unscaled, cost / length, max(violations) / size)
-
-
-def _confirm_negative(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
-    """Return the result of a sweep with negative curvature, which counts only if an admissible variation confirms it.
-
-    End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
-    freedom.
-    """
-    if variation.curvature < -FLAT_SHARE * scale and variation.slip < SOLVER_SHARE:
-        return _Swept(least, at, "", (variation.controls, variation.states))
-    return _Swept(least, at, f"constraints are nearly dependent at {at or 0.0:.4g} s", None, dependent=True)
+    if not (cost < -FLAT_SHARE * sweep.scale * length and max(violations) < SOLVER_SHARE * size):
+        reason = f"constraints are nearly dependent at {time or 0.0:.4g} s"
+        return Curvature(least, time, reason, None, along.t, dependent=True)
+    values = (values / np.repeat(sweep.metric, nu, axis=1)).reshape(n * q, nu) * accessory.range
+    return Curvature(least, time, "", (values, states[:, : accessory.nx] * accessory.unit[: accessory.nx]), along.t)
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:

@@ -14,8 +14,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ocp.audit.sizes import Sizes, nearest_bound, share_sizes
-from ocp.problem.formulation import Bounds, Formulation
+from ocp.audit.sizes import fine_grid, nearest_bound, share_sizes, sizes
+from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 from ocp.solution_data import stack
@@ -58,8 +58,8 @@ class Limits:
         self.gap = np.minimum(*gaps)
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
-    def at(self, points: slice) -> Limits:
-        """Return the limits at a slice of the points of the plan."""
+    def at(self, points: Any) -> Limits:
+        """Return the limits at some of the points of the plan, given by a slice or an array of indices."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
@@ -78,6 +78,11 @@ class Limits:
         """Whether the plan is so near the lower or upper limit that the limit may be active. Shape (M, m), bool."""
         return np.asarray(self.lower | self.upper)
 
+    @property
+    def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
+        """For upper, then lower limits: which may be active (equalities once), the distances, and the sign 1 or -1."""
+        return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
+
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the complementarity products: absolute multipliers times distances to the limits. Shape (M, m)."""
         gap = np.where(multipliers > 0, self.above, self.below)
@@ -88,16 +93,18 @@ class Linearisation:
     """First derivatives of cost, dynamics and constraints along a plan, at Gauss points of its intervals.
 
     Attributes:
+        p, bounds: Parameters, shape (np,), and the bounds of the problem at these.
+        grid, sizes: Samples of the plan on its fine grid, and the sizes of all quantities along it.
         width: Widths of the N mesh intervals, as fractions of the horizon. Shape (N,).
         weight, places: Quadrature weights and positions of the Gauss points in an interval. Shape (q,).
         matrix: Runge-Kutta matrix of these points. Shape (q, q).
         shape: (N, q).
+        interval_ends: Indices of the mesh nodes at both ends of each interval. Shape (N, 2).
         s, t: Fractions of the horizon and times (s) of the M = N q points. Shape (M,).
         nodal: Whether the plan is reported only at the ends of the intervals.
         x, u, costate: States, controls and costates of the plan at the points, as it reports them. Shape (M, n).
         cost_y, rate_y: Derivatives of T L and T f in y = (x, T, u). Shapes (M, ny), (M, nx, ny).
         row, row_y: Rows of the path constraints and their derivatives. Shapes (M, r), (M, r, ny).
-        sizes: Sizes of all quantities along the plan.
         state_size: Sizes of the states by which costates are judged. Shape (nx,).
         control_size: Sizes of the controls by which distances to their limits are judged. Shape (nu,).
         end_row, end_y: Rows of end, then start constraints, and their derivatives with respect to end state x, start
@@ -115,17 +122,21 @@ class Linearisation:
         pseudo_inverses: Cache of :func:`ocp.audit.principle.pseudo_inverse_of`.
     """
 
-    def __init__(self, form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds, *, sizes: Sizes) -> None:
-        self.form, self.solution, self.p, self.bounds, self.sizes = form, solution, p, bounds, sizes
+    def __init__(self, form: Formulation, solution: Solution) -> None:
+        self.form, self.solution = form, solution
+        self.p = form.parameter_vector(solution.parameters)
+        self.bounds, self.grid = form.bound_values(self.p), fine_grid(solution, self.p)
+        self.sizes = sizes(form, self.grid, self.bounds)
         mesh = solution.control_interpolant.breaks
         self.mesh, self.width = mesh, np.diff(mesh)
         n = len(self.width)
         segments = (len(solution.state_interpolant.breaks) - 1) / n
         degree = max(len(solution.control_interpolant.nodes), solution.state_interpolant.values.shape[1] - 1)
         q = MAX_POINTS if segments > 1 else int(np.clip(max(degree, ENOUGH_POINTS / n), MIN_POINTS, MAX_POINTS))
-        self.shape = n, q
+        self.shape, self.interval_ends = (n, q), np.add.outer(np.arange(n), [0, 1])
         self.places = np.array(ca.collocation_points(q, "legendre"))
-        self.matrix, self.weight = gauss(self.places)
+        self.matrix, self.weight = np.split(quadrature(self.places, np.append(self.places, 1.0)), [q])
+        self.weight = self.weight[0]
         self.s = (mesh[:-1, None] + self.width[:, None] * self.places).ravel()
         self.t = self.s * solution.horizon
         self.nodal = len(solution.t) == n + 1
@@ -264,9 +275,8 @@ class Linearisation:
         self.low, self.high = (np.tile(side[nx : nx + nu], (n * q, 1)) for side in (low, high))
         eye = np.broadcast_to(np.eye(nu), (n * q, nu, nu))
         self.control_limits_u = np.concatenate([eye, self.row_y[:, self.mixed, nx + 1 :]], axis=1)
-        self.state_limits_x = np.zeros((n * q, len(states), nx + 1))
-        self.state_limits_x[:, :nx, :nx] = np.eye(nx)
-        self.state_limits_x[:, nx:] = self.row_y[:, self.still, : nx + 1]
+        own = np.eye(nx, nx + 1)
+        self.state_limits_x = np.hstack([np.tile(own, (n * q, 1, 1)), self.row_y[:, self.still, : nx + 1]])
 
         at = self.mesh
 
@@ -282,9 +292,8 @@ class Linearisation:
         self.node_limits = Limits(
             np.hstack([x, row]), low[states], high[states], equal[states], size=size[states], tightened=at_nodes
         )
-        self.node_limits_x = np.zeros((n + 1, len(states), nx + 1))
-        self.node_limits_x[:, :nx, :nx] = np.eye(nx)
-        self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
+        rows_x = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
+        self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
         """Add state equalities as limits of the controls: differentiate them in time until a control appears.
@@ -347,12 +356,6 @@ def ends_of(form: Formulation) -> Any:
     outputs = [rows, ca.jacobian(rows, y), slope, curved]
     symbols = [form.x, form.x0, form.u, form.u0, form.T, form.p]
     return ca.Function("ends", symbols, [ca.densify(output) for output in outputs])
-
-
-def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Runge-Kutta matrix and weights of collocation at q positions in 0..1. Shapes (q, q) and (q,)."""
-    weights = quadrature(places, np.append(places, 1.0))
-    return weights[:-1], weights[-1]
 
 
 def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:

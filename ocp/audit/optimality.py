@@ -17,13 +17,10 @@ import casadi as ca
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem
-from ocp.audit.costates import Adjoint, EndLimits, Ends, adjoint, end_limits, interval_end_costates
+from ocp.audit.costates import Adjoint, Ends, adjoint, end_limits, interval_end_costates
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Limits, Linearisation
 from ocp.audit.principle import Hamiltonian, control_loss, hamiltonian, needle_loss, reduced_slope, switching_loss
-from ocp.audit.sizes import sizes
-from ocp.problem.formulation import Bounds, Formulation
-from ocp.solution import Solution
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 
 PROXIMITY_WEIGHT = 1e-5
@@ -179,7 +176,7 @@ class _Dual:
         width = (along.high - along.low).max(axis=0, initial=0.0)
         self.step = np.where(np.isfinite(width), np.maximum(width, along.sizes.control), along.sizes.control)
         reachable = np.einsum("k,kij,j->i", along.share, np.abs(along.rate_y[:, :, nx + 1 :]), self.step)
-        self.end_price = max(1.0, float((reachable / along.state_size).max(initial=0.0)))
+        self.residual_price = max(1.0, float((reachable / along.state_size).max(initial=0.0)))
         # arcs of the states are among the state limits
         controls, states, slopes = along.control_limits, along.state_limits, along.control_limits_u
         chosen = controls.near & (np.arange(slopes.shape[1]) < nu + len(along.mixed))
@@ -245,27 +242,20 @@ class _Dual:
 
     def _ends(self) -> None:
         """Add the transversality conditions, with residuals penalised by how far the controls could move the states."""
-        along, program, nx = self.along, self.program, self.along.form.nx
-        form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
-        places, share = form.bounds.places, along.share
-        fixed = [low[places[k]] == high[places[k]] for k in ("terminal", "initial")]
-        self.free = ~np.append(np.concatenate(fixed), not form.horizon_is_free)
-        self.scale = np.concatenate([along.state_size, along.state_size, [horizon]])
-        self.ends: EndLimits = end_limits(along)
-        self.reach = np.abs(self.ends.slope) @ self.scale
-        self.end_index = program.variables(
-            len(self.reach), np.where(self.ends.equal, -np.inf, 0.0), self.ends.gap / self.reach
-        )
-        right = along.final_y * self.scale / self.cost
+        along, program, nx, share = self.along, self.program, self.along.form.nx, self.along.share
+        ends, horizon = end_limits(along), along.solution.horizon
+        self.ends, free = ends, ends.free
+        self.end_price = ends.gap / ends.reach
+        self.end_index = program.variables(len(ends.gap), np.where(ends.equal, -np.inf, 0.0), self.end_price)
+        right = along.final_y * ends.unit / self.cost
         right[-1] += horizon / self.cost * float(share @ along.cost_y[:, nx])
         rows = np.full(2 * nx + 1, -1)
-        rows[self.free] = program.equations(right[self.free])
-        states = np.flatnonzero(self.free[:-1])
+        rows[free] = program.equations(right[free])
+        states = np.flatnonzero(free[:-1])
         at_ends = np.concatenate([self.nodes[-1], self.nodes[0]])
         program.add(rows[states], at_ends[states], np.where(states < nx, 1.0, -1.0))
-        slope = self.ends.slope * (self.ends.sign / self.reach)[:, None] * self.scale
-        program.add(rows[self.free], self.end_index[:, None], -slope[:, self.free])
-        if form.horizon_is_free:
+        program.add(rows[free], self.end_index[:, None], -ends.scaled_slope[:, free])
+        if free[-1]:
             program.add(rows[-1], self.costate, -horizon * share[:, None] * along.rate_y[:, :, nx] / along.state_size)
             force = horizon * share[self.control_limits.point] * self.path_slope[:, nx]
             program.add(rows[-1], self.control_limits.index, -force)
@@ -273,8 +263,8 @@ class _Dual:
                 program.add(rows[-1], limits.index, -horizon * limits.slope[:, nx])
         self.end_residual = []
         for sign in (-1.0, 1.0):
-            self.end_residual.append(program.variables(int(self.free.sum()), 0.0, self.end_price))
-            program.add(rows[self.free], self.end_residual[-1], sign)
+            self.end_residual.append(program.variables(int(free.sum()), 0.0, self.residual_price))
+            program.add(rows[free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
         """Return the multipliers that fit the plan best, and its excess cost, from the solution of the program."""
@@ -290,9 +280,10 @@ class _Dual:
         at_nodes = self.node.table(x, along.node_limits.lower.shape)
         state_multipliers.reshape(n, q, -1)[:, -1] += at_nodes[1:] / along.share.reshape(n, q)[:, -1:]
         slope = np.zeros(2 * nx + 1)
-        slope[self.free] = (x[self.end_residual[1]] - x[self.end_residual[0]]) / self.scale[self.free]
-        end, start = self.ends.table(x[self.end_index] / self.reach)
-        charge = float(self.ends.gap / self.reach @ x[self.end_index])
+        ends = self.ends
+        slope[ends.free] = (x[self.end_residual[1]] - x[self.end_residual[0]]) / ends.unit[ends.free]
+        end, start = ends.table(x[self.end_index] / ends.reach)
+        charge = float(self.end_price @ x[self.end_index])
         after = x[self.nodes]
         before = after.copy()
         np.add.at(before, self.node.point, self.node.slope[:, :nx] * size * x[self.node.index, None])
@@ -345,27 +336,15 @@ class Optimality:
     has_linear_control: bool
 
 
-def optimality(
-    form: Formulation,
-    solution: Solution,
-    p: np.ndarray,
-    bounds: Bounds,
-    *,
-    along: Linearisation | None = None,
-    allowed: float = LIMIT_SHARE,
-) -> Optimality:
+def optimality(along: Linearisation, allowed: float = LIMIT_SHARE) -> Optimality:
     """Compute the multipliers of a plan, its excess cost over the optimum, and the curvature of the cost.
 
-    Args:
-        form, p, bounds: The problem, its parameters, and its bounds at these.
-        solution: The plan.
-        along: Linearisation of the plan, if known.
-        allowed: Loss, as a share of the cost, above which better multipliers than the reported costates are searched.
+    If the loss exceeds the share ``allowed`` of the cost, better multipliers than the reported costates are searched.
     """
-    along = along or Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
-    if not (along.finite and np.isfinite(solution.cost)):
-        return undefined_result(along, hamiltonian(form, solution, p))
-    cost = abs(solution.cost) or along.slope_size or 1.0
+    plan_cost = abs(along.solution.cost)
+    if not (along.finite and np.isfinite(plan_cost)):
+        return undefined_result(along)
+    cost = plan_cost or along.slope_size or 1.0
     curved = _control_curvature(along)
     first = adjoint(along, curved, cost)
     if first.node_shifts.any():
@@ -378,7 +357,7 @@ def optimality(
             first, loss = candidate, new_loss
     accessory = AccessoryProblem(along, first)
     spread = accessory.hamiltonian_scale
-    cost = max(abs(solution.cost), accessory.negligible_cost) or 1.0
+    cost = max(plan_cost, accessory.negligible_cost) or 1.0
     total, best = _loss_by_interval(along, first, accessory.curved), first
     loss, costate_error = _total_loss(total, first), 0.0
     is_degenerate = along.may_be_degenerate or bool(accessory.linear_controls.any())
@@ -405,7 +384,7 @@ def optimality(
         along.t,
         reduced_slope(along, best.costate, best.control_multipliers),
         best,
-        hamiltonian(form, solution, p),
+        hamiltonian(along),
         second_order,
         costate_accuracy,
         costate_error,
@@ -450,7 +429,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
     return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
-def undefined_result(along: Linearisation, values: Hamiltonian) -> Optimality:
+def undefined_result(along: Linearisation) -> Optimality:
     """Return the result for a plan along which the problem has values that are not finite; all its checks fail."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
@@ -461,4 +440,5 @@ def undefined_result(along: Linearisation, values: Hamiltonian) -> Optimality:
     shifts = np.zeros((n + 1, form.nx))
     known = Adjoint(t, costate, of_controls, of_states, infinite, np.inf, infinite, infinite, shifts, ends)
     curved = Curvature(np.nan, None, "the problem is not a number along the plan", None, along.t)
-    return Optimality(infinite, 1.0, 1.0, along.t, np.full(m, np.inf), known, values, curved, 0.0, 0.0, False)
+    slopes, values = np.full(m, np.inf), hamiltonian(along)
+    return Optimality(infinite, 1.0, 1.0, along.t, slopes, known, values, curved, 0.0, 0.0, False)

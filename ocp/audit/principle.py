@@ -16,9 +16,7 @@ import numpy as np
 
 from ocp.audit.linearisation import Linearisation
 from ocp.errors import ProblemError
-from ocp.problem.formulation import Formulation
 from ocp.problem.intervals import Interval, check_instructions, evaluate
-from ocp.solution import Solution
 from ocp.solution_data import stack
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
@@ -31,12 +29,10 @@ class Hamiltonian:
     """The Hamiltonian along a plan.
 
     Attributes:
-        t: Reported times of the plan, s. Shape (M,).
-        values: L + costate . f at these times, in cost per second. Shape (M,).
+        values: L + costate . f at the reported times of the plan, in cost per second. Shape (M,).
         scale: Largest value of |L| + sum |costate_i f_i|.
     """
 
-    t: np.ndarray
     values: np.ndarray
     scale: float
 
@@ -46,15 +42,16 @@ class Hamiltonian:
         return float(np.ptp(self.values))
 
 
-def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamiltonian:
+def hamiltonian(along: Linearisation) -> Hamiltonian:
     """Return the Hamiltonian at the reported times of a plan."""
+    form, solution = along.form, along.solution
     pools = (solution.states, solution.controls, solution.costates)
     x, u, costate = (stack(pool, len(solution.t)) for pool in pools)
     lam = form.sym("lam", form.nx)
-    point = x, u, solution.t, solution.horizon, p, (lam, costate)
+    point = x, u, solution.t, solution.horizon, along.p, (lam, costate)
     running, products = form.sampled(lambda: [form.running, lam * form.f], *point, cache_as="Hamiltonian")
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
-    return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
+    return Hamiltonian(running[:, 0] + products.sum(axis=1), scale or 1.0)
 
 
 def global_optimum(along: Linearisation, negligible: float) -> str:

@@ -12,7 +12,7 @@ as a small violation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -34,12 +34,9 @@ class Reintegration:
     """States that the controls of a plan produce, re-integrated on the fine grid of the plan.
 
     Attributes:
-        t: Times, s. Every interval is listed from start to end, so that interior mesh times occur twice. Shape (M,).
-        interval: Interval of each time. Shape (M,).
+        grid: The plan on its fine grid, with M samples.
         states: Integrated from the start to the end of the plan; nan after a breakdown. Shape (M, nx).
-        controls: Controls of the plan, evaluated from the side of the interval. Shape (M, nu).
         local: Integrated over each interval from the plan's own state at its start. Shape (M, nx).
-        plan: Interpolated states of the plan. Shape (M, nx).
         cost: Running cost integrated along ``states``.
         local_cost: Running cost integrated along ``local``.
         errors: Largest difference of ``states`` from the plan, relative to the sizes of the states. Shape (M,).
@@ -49,12 +46,9 @@ class Reintegration:
         breakdown_time: Time at which the integration fails, s, or None.
     """
 
-    t: np.ndarray
-    interval: np.ndarray
+    grid: FineGrid
     states: np.ndarray
-    controls: np.ndarray
     local: np.ndarray
-    plan: np.ndarray
     cost: float
     local_cost: float
     errors: np.ndarray
@@ -71,26 +65,23 @@ class Reintegration:
         beyond = ~(self.errors <= limit)
         if not beyond.any():
             return False
-        first = int(np.argmax(beyond))
-        k = int(self.interval[first])
-        defect = self.local_errors[self.interval == k].max()
+        k = int(np.argmax(beyond)) // self.grid.samples
+        defect = self.local_errors.reshape(-1, self.grid.samples)[k].max()
         return bool(self.added[k] + defect <= limit / SETTINGS.growth)
 
 
-def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
+def reintegrate(along: Linearisation) -> Reintegration:
     """Integrate the dynamics under the controls of a plan, over every interval and over the whole horizon."""
-    sizes, starts = along.sizes, grid.states.reshape(-1, grid.samples, along.form.nx)[:, 0]
-    local, states, local_cost, cost = corrected_motion(along, grid) or integrated_motion(along, grid)
+    sizes, grid = along.sizes, along.grid
+    starts = grid.states.reshape(-1, grid.samples, along.form.nx)[:, 0]
+    local, states, local_cost, cost = corrected_motion(along) or integrated_motion(along)
     defects = np.abs(local[:-1, -1] - starts[1:]) / sizes.state
     local, states = (part.reshape(grid.states.shape) for part in (local, states))
     failed = ~np.isfinite(states).all(axis=1)
     return Reintegration(
-        grid.t,
-        grid.interval,
+        grid,
         states,
-        grid.controls,
         local,
-        grid.states,
         cost,
         local_cost,
         _worst(np.abs(states - grid.states) / sizes.state),
@@ -100,14 +91,14 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
     )
 
 
-def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
+def integrated_motion(along: Linearisation) -> IntegratedMotion:
     """Return the motion that the controls of a plan produce, integrated step by step with error control."""
-    n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
-    flow = Flow(along)
-    starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
+    n, cells, flow = along.shape[0], along.grid.samples - 1, Flow(along)
+    plan = along.grid.states.reshape(n, cells + 1, -1)
+    starts = plan[:, 0]
     after, steps = flow.integrate(np.repeat(np.arange(n), cells), starts)
     by_interval = after.reshape(n, cells, -1)
-    deviation = np.abs(by_interval[:, :, :-1] - grid.states.reshape(n, cells + 1, -1)[:, 1:]) / along.sizes.state
+    deviation = np.abs(by_interval[:, :, :-1] - plan[:, 1:]) / along.sizes.state
     # steps that fail beside the plan are too long for stiff dynamics; a motion that diverges leaves the plan before
     is_stiff = not np.isfinite(after).all() and not (deviation > 1.0).any()
     if is_stiff and (motion := stiff_motion(along, starts, cells)) is not None:
@@ -330,13 +321,13 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
     allowed ``share`` equals the tolerance. It is then also judged along the states of the plan itself, which are the
     ones that are executed.
     """
-    form, sizes, p, horizon, (lower, upper) = along.form, along.sizes, along.p, along.solution.horizon, along.bounds
-    places = form.bounds.places
+    form, sizes, (lower, upper), places = along.form, along.sizes, along.bounds, along.form.bounds.places
+    grid = replace(motion.grid, states=states)
     results: list[Violation] = []
     whole, first, last = slice(None), slice(0, 1), slice(-1, None)
     for kind, pool, values, size, at, description in (
         ("state", form.states, states, sizes.state, whole, "bounds of"),
-        ("control", form.controls, motion.controls, sizes.control, whole, "bounds of"),
+        ("control", form.controls, grid.controls, sizes.control, whole, "bounds of"),
         ("initial", form.states, states, sizes.state, first, "start of"),
         ("terminal", form.states, states, sizes.state, last, "end of"),
     ):
@@ -348,35 +339,30 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
                 bounded = low == high
             if np.any(bounded):
                 excess = excess_over(values[at][:, place][:, bounded], low[bounded], high[bounded])
-                results.append(_violation_of(f"{description} {name}", name, motion.t[at], excess, size[place][bounded]))
-    initial = states[0], motion.controls[0]
+                results.append(_violation_of(f"{description} {name}", name, grid.t[at], excess, size[place][bounded]))
     entries = LIMIT_SHARE * np.concatenate([sizes.state, sizes.control])
-    point = states, motion.controls, motion.t, horizon, p, (form.x0, initial[0]), (form.u0, initial[1])
+    point = grid.point(form)
     outputs = [form.path.expression, form.watch.expression]
     sampled = dict(zip(("path", "watch"), form.sampled(outputs, *point, cache_as="rows along a plan"), strict=True))
     for kind, at in (("path", whole), ("start", first), ("end", last), ("watch", whole)):
         rows, size = getattr(form, kind), getattr(sizes, kind)
         if len(rows) == 0:
             continue
-        x, u, t = states[at], motion.controls[at], motion.t[at]
-        if kind in sampled:
-            g = sampled[kind]
-        else:
-            starts = (form.x0, initial[0]), (form.u0, initial[1])
-            g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, cache_as=(kind, "from the start"))[0]
+        t, g = grid.t[at], sampled.get(kind)
+        if g is None:
+            g = form.sampled([rows.expression], *grid.point(form, at), cache_as=(kind, "from the start"))[0]
         excess = excess_over(_with_integrals(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
-            g_reported = form.sampled(outputs, motion.plan, *point[1:], cache_as="rows along a plan")[kind == "watch"]
-            g_reported = _with_integrals(form, kind, g_reported, t)
+            both = form.sampled(outputs, motion.grid.states, *point[1:], cache_as="rows along a plan")
+            g_reported = _with_integrals(form, kind, both[kind == "watch"], t)
             reported_excess = excess_over(g_reported, lower[rows.bounds], upper[rows.bounds])
             excess = np.where(limited, np.maximum(excess, reported_excess), excess)
         size = np.tile(size, (len(t), 1))
         at_max = np.argmax(excess, axis=0), np.arange(len(rows))
         # judge a violation by its local rate of change
         if kind != "watch" and np.any(excess[at_max] > SOLVER_SHARE * size[at_max]):
-            samples = x[at_max[0]], u[at_max[0]], t[at_max[0]]
-            _, change = row_changes(form, kind, samples, initial, horizon=horizon, p=p, moves=entries)
+            _, change = row_changes(form, kind, grid, np.arange(len(grid.t))[at][at_max[0]], moves=entries)
             local_size = change.sum(axis=0)[at_max[1], at_max[1]] / LIMIT_SHARE
             size[at_max] = np.clip(local_size, SOLVER_SHARE * size[at_max], size[at_max])
         with np.errstate(divide="ignore"):

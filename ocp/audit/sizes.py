@@ -32,29 +32,33 @@ class FineGrid:
 
     Attributes:
         t: Times, s. Shape (M,).
-        interval: Interval of each time. Shape (M,).
-        place: Position of each time in its interval, 0..1. Shape (M,).
         states, controls: Interpolated values of the plan, from the side of the interval. Shape (M, nx), (M, nu).
         samples: Number of times in one interval.
+        horizon: Duration of the plan, s.
+        p: Parameters. Shape (np,).
     """
 
     t: np.ndarray
-    interval: np.ndarray
-    place: np.ndarray
     states: np.ndarray
     controls: np.ndarray
     samples: int
+    horizon: float
+    p: np.ndarray
+
+    def point(self, form: Formulation, at: slice = slice(None)) -> tuple[Any, ...]:
+        """Return samples, and the states and controls at the start, as arguments of :meth:`Formulation.sampled`."""
+        starts = (form.x0, self.states[0]), (form.u0, self.controls[0])
+        return self.states[at], self.controls[at], self.t[at], self.horizon, self.p, *starts
 
 
-def fine_grid(solution: Solution) -> FineGrid:
-    """Return the samples of a plan on a grid with ten times as many points as the plan has."""
+def fine_grid(solution: Solution, p: np.ndarray) -> FineGrid:
+    """Return the samples of a plan with parameters ``p`` on a grid with ten times as many points as the plan has."""
     curve = solution.state_interpolant
     n = len(solution.control_interpolant.breaks) - 1
     points, segments = max(len(curve.nodes) - 1, 1), max((len(curve.breaks) - 1) // n, 1)
-    steps = GRID_FACTOR * points * segments
-    places = np.linspace(0.0, 1.0, steps + 1)
-    states, controls, t = plan_at(solution, places)
-    return FineGrid(t, np.repeat(np.arange(n), steps + 1), np.tile(places, n), states, controls, steps + 1)
+    samples = GRID_FACTOR * points * segments + 1
+    states, controls, t = plan_at(solution, np.linspace(0.0, 1.0, samples))
+    return FineGrid(t, states, controls, samples, solution.horizon, p)
 
 
 @np.errstate(invalid="ignore")  # nan is reported later, with its name
@@ -104,19 +108,14 @@ class Sizes:
     cost: float
 
 
-def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the characteristic sizes of states, controls, constraints and cost along a plan.
+def sizes(form: Formulation, grid: FineGrid, bounds: Bounds) -> Sizes:
+    """Return the characteristic sizes of states, controls, constraints and cost for a plan sampled on its fine grid.
 
     A quantity that rests at zero but for rounding has no size of its own. Its size is a millionth of its smallest
     declared bound, of the largest size of its kind, or of one SI unit, whichever is least. The size of a constraint is
     its change along the plan, or the sum of its changes when single entries of the states or controls, also of those at
     the start, change by their sizes.
     """
-    return sizes_along(form, fine_grid(solution), solution.horizon, p=p, bounds=bounds)
-
-
-def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the characteristic sizes of all quantities for a plan sampled on its fine grid; see `sizes`."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
     ends = [np.where(low == high, low, np.nan) for low, high in fixed]
@@ -125,24 +124,19 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
     declared = _select(bounds, places["control"])
     control, control_moves = _sizes_of(grid.controls, declared, [], np.zeros(form.nu, dtype=bool))
     entries = np.concatenate([state, control]), np.concatenate([state_moves, control_moves])
-    point = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
     outputs = [form.running, form.path.expression, form.watch_reference_rate]
-    running, rows, path_lengths = form.sampled(outputs, *point, cache_as="along a plan")
-    path = _constraint_sizes(form, "path", grid, horizon, p, bounds, entries, rows)
-    start, end = (_constraint_sizes(form, kind, grid, horizon, p, bounds, entries) for kind in ("start", "end"))
+    running, rows, path_lengths = form.sampled(outputs, *grid.point(form), cache_as="along a plan")
+    path = _constraint_sizes(form, "path", grid, bounds, entries, rows)
+    start, end = (_constraint_sizes(form, kind, grid, bounds, entries) for kind in ("start", "end"))
     absolute = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
     integral_of_cost = float(np.sum(np.diff(grid.t) * (absolute[:-1] + absolute[1:]) / 2))
     by_variables = [
-        _change_by_variables(form, kind, grid, at, horizon, p, entries)[0][0]
+        _change_by_variables(form, kind, grid, at, entries)[0][0]
         for kind, at in zip(COSTS, (evenly_spaced(grid), evenly_spaced(grid)[-1:]), strict=True)
     ]
-    watch = _watched_row_sizes(
-        form,
-        _constraint_sizes(form, "watch", grid, horizon, p, bounds, _sizes_by_unit(form, entries)),
-        horizon,
-        integral(path_lengths, grid.t),
-    )
-    floor = SOLVER_SHARE * (horizon * by_variables[0] + by_variables[1])
+    watch = _constraint_sizes(form, "watch", grid, bounds, _sizes_by_unit(form, entries))
+    watch = _watched_row_sizes(form, watch, grid.horizon, integral(path_lengths, grid.t))
+    floor = SOLVER_SHARE * (grid.horizon * by_variables[0] + by_variables[1])
     return Sizes(state, control, path, start, end, watch, max(integral_of_cost, floor))
 
 
@@ -220,8 +214,6 @@ def _constraint_sizes(
     form: Formulation,
     kind: str,
     grid: FineGrid,
-    horizon: float,
-    p: np.ndarray,
     bounds: Bounds,
     entries: tuple[np.ndarray, np.ndarray],
     values: np.ndarray | None = None,
@@ -235,7 +227,7 @@ def _constraint_sizes(
         return np.zeros(0)
     chosen = evenly_spaced(grid)
     samples = chosen[:1] if kind == "start" else chosen[-1:] if kind == "end" else chosen
-    change, moves, spread, largest = _change_by_variables(form, kind, grid, samples, horizon, p, entries)
+    change, moves, spread, largest = _change_by_variables(form, kind, grid, samples, entries)
     if values is not None:
         spread, largest = _spread(values)
     change = np.where(moves | (largest <= STANDSTILL), change, 0.0)  # a constant value has a size of its own
@@ -287,13 +279,7 @@ def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _change_by_variables(
-    form: Formulation,
-    kind: str,
-    grid: FineGrid,
-    samples: np.ndarray,
-    horizon: float,
-    p: np.ndarray,
-    entries: tuple[np.ndarray, np.ndarray],
+    form: Formulation, kind: str, grid: FineGrid, samples: np.ndarray, entries: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return how strongly the constraints of one kind depend on states and controls, at given samples.
 
@@ -301,9 +287,7 @@ def _change_by_variables(
         Of each row, shape (rows,): the sum of its changes when single entries change by their sizes; whether an entry
         that moves along the plan enters it; its spread; its largest absolute value.
     """
-    x, u = grid.states[samples], grid.controls[samples]
-    initial = grid.states[0], grid.controls[0]
-    values, change = row_changes(form, kind, (x, u, grid.t[samples]), initial, horizon=horizon, p=p, moves=entries[0])
+    values, change = row_changes(form, kind, grid, samples, moves=entries[0])
     change = change.max(axis=1)
     moves = np.resize(entries[1], len(change))
     by_moving, by_all = change[moves].sum(axis=0), change.sum(axis=0)
@@ -312,38 +296,32 @@ def _change_by_variables(
 
 
 def row_changes(
-    form: Formulation,
-    kind: str,
-    samples: tuple[np.ndarray, np.ndarray, np.ndarray],
-    begin: tuple[np.ndarray, np.ndarray],
-    *,
-    horizon: float,
-    p: np.ndarray,
-    moves: np.ndarray,
+    form: Formulation, kind: str, grid: FineGrid, samples: np.ndarray, *, moves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the values of the constraints of one kind at K samples, and their changes with each state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.
-        samples: States (K, nx), controls (K, nu) and times (K,), s.
-        begin: States and controls at the start.
+        grid: Plan, sampled on its fine grid.
+        samples: Indices of the samples. Shape (K,).
         moves: Change of each state and control, also at the start, applied with both signs. Shape (nx + nu,).
 
     Returns:
         Shapes (K, rows) and (entries, K, rows): the larger change of both signs. Entries at the start come last.
     """
-    x, u, t = samples
+    x, u, t = grid.states[samples], grid.controls[samples], grid.t[samples]
     size, count = form.nx + form.nu, len(t)
     expression = getattr(form, kind) if kind in COSTS else getattr(form, kind).expression
     uses_start = form.cached((kind, "tied"), lambda: ca.depends_on(expression, ca.vertcat(form.x0, form.u0)))
     used = 2 * size if uses_start else size
     steps = np.vstack([np.zeros(2 * size), *(s * np.diag(np.concatenate([moves, moves]))[:used] for s in (1.0, -1.0))])
     sample = np.tile(np.arange(count), len(steps))
-    first = np.broadcast_to(np.concatenate(begin), (len(sample), size))
+    first = np.broadcast_to(np.concatenate([grid.states[0], grid.controls[0]]), (len(sample), size))
     columns = np.hstack([x[sample], u[sample], first]) + np.repeat(steps, count, axis=0)
     x, u, x0, u0 = np.split(columns, np.cumsum([form.nx, form.nu, form.nx]), axis=1)
     starts = (form.x0, x0), (form.u0, u0)
-    values = form.sampled([expression], x, u, t[sample], horizon, p, *starts, cache_as=(kind, "from the start"))[0]
+    point = x, u, t[sample], grid.horizon, grid.p, *starts
+    values = form.sampled([expression], *point, cache_as=(kind, "from the start"))[0]
     g = values.reshape(len(steps), count, -1)
     change = np.abs(np.where(np.isfinite(g[1:] - g[0]), g[1:] - g[0], 0.0))
     return g[0], change.reshape(2, used, count, -1).max(axis=0)

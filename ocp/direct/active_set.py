@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from ocp.console import reason_to_stop
-from ocp.direct.assembly import Program, Transcription
+from ocp.direct.assembly import Program, Transcription, places_of
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.direct.scaling import Scales
 from ocp.errors import SolverStatus
@@ -58,34 +58,26 @@ class Conditions:
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
     """Return the terms of the first-order conditions at a solver's result, for the given parameters and bounds."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
-    a, b, c = scales.variables, scales.rows, scales.cost
-    slope, jacobian = program.numbers.first(v, p)
-    slope, jacobian = slope * a / c, scale_matrix(jacobian, 1 / b, a)
-    half = scale_matrix(program.numbers.second(v, p, 1.0, lam), a / c, a)
-    hessian = half + scipy.sparse.triu(half, 1).T
-    of_rows = lam * b / c
-    of_bounds = -(slope + jacobian.T @ of_rows)
-    held = at_limit(outcome.rows / b, arguments["lbg"] / b, arguments["ubg"] / b, of_rows)
-    fixed = at_limit(v / a, arguments["lbx"] / a, arguments["ubx"] / a, of_bounds)
-    return Conditions(
-        scipy.sparse.csc_array(hessian), scipy.sparse.csr_array(jacobian), of_bounds, of_rows, held, fixed
-    )
+    a = scales.variables
+    jacobian = scipy.sparse.csr_array(scale_matrix(program.numbers.first(v, p)[1], 1 / scales.rows, a))
+    half = scale_matrix(program.numbers.second(v, p, 1.0, lam), a / scales.cost, a)
+    hessian = scipy.sparse.csc_array(half + scipy.sparse.triu(half, 1).T)
+    values = scaled_values(program, outcome, arguments, scales)
+    held, fixed = (at_limit(*values[kind]) for kind in "gx")
+    return Conditions(hessian, jacobian, values["x"][3], values["g"][3], held, fixed)
 
 
 def scaled_values(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
 ) -> dict[str, tuple[np.ndarray, ...]]:
     """Return values, limits and multipliers of variables (x) and constraints (g) in the solver's scaled units."""
-    v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
-    result: dict[str, tuple[np.ndarray, ...]] = {}
-    slope, jacobian = program.numbers.first(v, p)
-    of_bounds, of_rows = -(slope + jacobian.T @ lam) * scales.variables / scales.cost, lam * scales.rows / scales.cost
-    for kind, value, unit, multiplier in (
-        ("x", v, scales.variables, of_bounds),
-        ("g", outcome.rows, scales.rows, of_rows),
-    ):
-        result[kind] = value / unit, arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit, multiplier
-    return result
+    v, lam = outcome.variables, outcome.multipliers
+    slope, jacobian = program.numbers.first(v, arguments["p"])
+    parts = {"x": (v, scales.variables, -(slope + jacobian.T @ lam)), "g": (outcome.rows, scales.rows, lam)}
+    return {
+        kind: (value / unit, arguments[f"lb{kind}"] / unit, arguments[f"ub{kind}"] / unit, force * unit / scales.cost)
+        for kind, (value, unit, force) in parts.items()
+    }
 
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
@@ -176,8 +168,8 @@ class Newton:
     def __init__(self, program: Program, transcription: Transcription) -> None:
         self._program = program
         n, m = transcription.size, transcription.n_rows
-        row, column = (np.array(part, dtype=np.int64) for part in program.jacobian.sparsity_out(1).get_triplet())
-        first, second = (np.array(part, dtype=np.int64) for part in program.hessian.sparsity_out(0).get_triplet())
+        row, column = places_of(program.jacobian.sparsity_out(1))
+        first, second = places_of(program.hessian.sparsity_out(0))
         self._row, self._column, self._first, self._second = row, column, first, second
         slopes = scipy.sparse.csr_array((np.ones(len(row)), (row, column)), shape=(m, n))
         both = (slopes.T @ slopes).tocoo()

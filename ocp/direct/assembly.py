@@ -18,6 +18,7 @@ import scipy
 
 from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
+from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
 
@@ -111,8 +112,8 @@ class Transcription:
         report_states: Indices of the states at the reported points. Shape (M, nx).
         nodes: Indices of the states at the nodes. Shape (nx, N + 1).
         row_stages: Interval of each row; -1 for rows that only involve the ends. Length n_rows.
-        costate_rows: Rows whose multipliers are the costates at the reported points; -1 if the point is the node
-            ``costate_nodes`` (M,), whose costate follows from the intervals after it. Shape (M, nx).
+        costate_rows: Rows whose multipliers are the costates at the reported points; -1 if the point is a node, whose
+            costate follows from the intervals after it. Shape (M, nx).
         costate_scale: Factor from multiplier to costate. Shape (M,).
         interpolants: Construction of the interpolants.
         stages: Stage structure of a stage-ordered program, or None.
@@ -135,7 +136,6 @@ class Transcription:
     nodes: np.ndarray
     row_stages: np.ndarray
     costate_rows: np.ndarray
-    costate_nodes: np.ndarray
     costate_scale: np.ndarray
     interpolants: Interpolants
     stages: Stages | None
@@ -154,6 +154,10 @@ class Transcription:
     def end(self) -> np.ndarray:
         """Indices of the variables of the final state. Shape (nx,)."""
         return self.nodes[:, -1]
+
+    def duration(self, form: Formulation, variables: np.ndarray, p: np.ndarray) -> float:
+        """Return the horizon (final time), s: the value of its variable, or the fixed one at given parameters."""
+        return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the solver arguments p, lbx, ubx, lbg and ubg for given parameters and values of the bound table."""
@@ -213,8 +217,7 @@ class Program:
     @cached_property
     def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of each nonzero of the Jacobian of the constraints."""
-        row, column = self.jacobian.sparsity_out(1).get_triplet()
-        return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
+        return places_of(self.jacobian.sparsity_out(1))
 
 
 class NumericDerivatives:

@@ -32,10 +32,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ class CodeSizes:
 CODE_SIZES = CodeSizes()
 
 
-def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
+def generate_c(functions: Sequence[Any], name: str, *, header: bool = True) -> list[str]:
     """Return C code and header (NAME.c and NAME.h) of casadi Functions as texts.
 
     Raises:
@@ -106,33 +106,20 @@ def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> l
     return [text.replace("0+ i*0", "0") for text in texts]
 
 
-@dataclass(frozen=True)
-class Library:
-    """A shared library that is compiled from generated C code and cached.
+def build_library(contents: Sequence[str], text: Callable[[], str]) -> Path:
+    """Return the path of a shared library compiled from C code, from the cache if possible.
 
-    Attributes:
-        contents: The data that determine its C code, such as serialised functions.
+    Ctrl-C and time limits end the compiler.
+
+    Args:
+        contents: The data that determine the C code, such as serialised functions.
         text: Function that generates the C code; not called if the library is in the cache.
-    """
-
-    contents: tuple[str, ...]
-    text: Callable[[], str]
-
-    @property
-    def key(self) -> str:
-        """Name of the library in the cache; raises CompilerError if there is no compiler."""
-        machine = (platform.machine(), sys.platform, ca.__version__, str(CODE_SIZES.optimized))
-        return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
-
-
-def build_library(library: Library) -> Path:
-    """Return the path of a compiled library, from the cache if possible. Ctrl-C and time limits end the compiler.
 
     Raises:
         CompilerError: There is no compiler, or it rejects the code.
         TimeLimitReached: The time limit is reached.
     """
-    key = library.key
+    key = library_key(contents)
     path = _OWN.get(key) or cache.load_library(key)
     if path is not None:
         return path
@@ -140,13 +127,19 @@ def build_library(library: Library) -> Path:
         path = _OWN.get(key) or cache.load_library(key)  # another process may have compiled it meanwhile
         if path is not None:
             return path
-        content = _compile(library.text())
+        content = _compile(text())
         path = cache.store_library(key, content)
     if path is None:  # for this process only
         path = Path(_own_folder().name) / f"{key}.so"
         path.write_bytes(content)
         _OWN[key] = path
     return path
+
+
+def library_key(contents: Sequence[str]) -> str:
+    """Return the name of a library in the cache; raise CompilerError if there is no compiler."""
+    machine = (platform.machine(), sys.platform, ca.__version__, str(CODE_SIZES.optimized))
+    return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *contents)
 
 
 _OWN: dict[str, Path] = {}
@@ -278,22 +271,30 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 
 
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write the C files of a problem for a controller to a folder; each file is written completely or not at all.
+    """Write the C files of a problem for a controller to a folder; return the folder and raise as :func:`write_c`."""
+    texts = {"curves.h": CURVES, "problem.h": problem_header(form, transcription), "main.c": MAIN, "Makefile": MAKEFILE}
+    return write_c(form, controller_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
+
+
+def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path, texts: dict[str, str]) -> Path:
+    """Write functions of a problem as NAME.c and NAME.h, and further files, to a folder that is created and returned.
+
+    Each file is written completely or not at all; files of the same names are replaced.
+
+    Args:
+        texts: Contents of the further files by name.
 
     Raises:
         ProblemError: Some part of the problem has no C, such as an integrator of variable step.
         OSError: The folder cannot be written.
     """
     try:
-        plan = generate_c(controller_functions(form, transcription, guess), "plan")
+        code, header = generate_c(functions, name)
     except CompilerError as error:
         raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
-    texts = dict(zip(("plan.c", "plan.h"), plan, strict=True))
-    texts |= {"curves.h": CURVES, "main.c": MAIN, "Makefile": MAKEFILE}
-    texts["problem.h"] = problem_header(form, transcription)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        write_text(folder / name, text)
+    for file, text in ({f"{name}.c": code, f"{name}.h": header} | texts).items():
+        write_text(folder / file, text)
     return folder
 
 
@@ -316,9 +317,14 @@ def problem_header(form: Formulation, transcription: Transcription) -> str:
     tables = {"breaks": curves.breaks, "nodes": curves.nodes, "mesh": curves.mesh, "samples": curves.control_nodes}
     for name, values in tables.items():
         lines.append(f"static const double plan_{name}[] = {{{', '.join(f'{value:.17g}' for value in values)}}};")
-    for name, words in (("parameters", form.parameter_labels), ("columns", [*form.state_labels, *form.control_labels])):
-        lines.append(f"static const char *const plan_{name}[] = {{{', '.join([*map(c_string, words), '0'])}}};")
+    lines.append(c_strings("plan_parameters", form.parameter_labels))
+    lines.append(c_strings("plan_columns", [*form.state_labels, *form.control_labels]))
     return "\n".join([*lines, ""])
+
+
+def c_strings(name: str, texts: Sequence[str]) -> str:
+    """Return the C definition of an array of texts, which a null pointer ends."""
+    return f"static const char *const {name}[] = {{{', '.join([*map(c_string, texts), '0'])}}};"
 
 
 def c_string(text: str) -> str:
@@ -473,17 +479,22 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
         if text not in by_text:
             is_short = block.function.is_a("SXFunction") and block.function.n_instructions() <= SIZES.called
             is_compiled = compiled and text.startswith(SERIALISED) and not is_short
-            by_text[text] = _compile_derivatives(block.function, text) if is_compiled else derivatives(block.function)
+            build = partial(derivatives, block.function)
+            functions = compile_functions((RECIPE, text), Derivatives._fields, build) if is_compiled else build()
+            by_text[text] = Derivatives(*functions)
     return [by_text[text] for text in texts]
 
 
-def _compile_derivatives(function: Any, text: str) -> Derivatives:
-    """Return a block's derivatives from a compiled library, or as interpreted functions if compilation fails."""
+def compile_functions(contents: Sequence[str], names: Sequence[str], build: Callable[[], Sequence[Any]]) -> list[Any]:
+    """Return casadi Functions from a compiled library or, with one warning, interpreted if they cannot be compiled.
+
+    Args:
+        contents: As of :func:`build_library`.
+        names, build: Names of the functions, and what returns them; not called if the library is in the cache.
+    """
     try:
-        path = build_library(
-            Library((RECIPE, text), lambda: generate_c(derivatives(function), "unit", header=False)[0])
-        )
-        return Derivatives(*(ca.external(name, str(path)) for name in Derivatives._fields))
+        path = build_library(contents, lambda: generate_c(build(), "unit", header=False)[0])
+        return [ca.external(name, str(path)) for name in names]
     except (CompilerError, RuntimeError) as error:
         warn_interpreted(str(error))
-        return derivatives(function)
+        return list(build())

@@ -28,21 +28,13 @@ import numpy as np
 from ocp.curves import lagrange
 from ocp.direct.active_set import at_limit
 from ocp.direct.assembly import ArrayFunction, assemble, build_function, derivatives, gather
-from ocp.direct.code_generation import (
-    CompilerError,
-    Library,
-    build_library,
-    c_string,
-    function_key,
-    generate_c,
-    warn_interpreted,
-)
+from ocp.direct.code_generation import c_strings, compile_functions, function_key, write_c
 from ocp.direct.guess import shifted_indices
 from ocp.direct.nlp import Outcome
 from ocp.errors import ProblemError, SolveError, SolverStatus, require
 from ocp.problem.values import symbols_of
 from ocp.solution import ByName, Solution
-from ocp.storage import checked_path, write_text
+from ocp.storage import checked_path
 
 HESSIANS = ("gauss-newton", "exact")
 QUIET = {"print_header": False, "print_iteration": False, "print_status": False, "print_time": False}
@@ -126,7 +118,10 @@ class Controller:
             words = "controller: shift requires equal intervals; use shift=0"
             raise ProblemError(words, name="shift", value=shift)
         self._functions = program_functions(prepared, settings.hessian)
-        functions = compile_functions(self._functions) if prepared.compiled else self._functions
+        functions = self._functions
+        if prepared.compiled:
+            keys, names = [function_key(f) for f in functions], [f.name() for f in functions]
+            functions = ProgramFunctions(*compile_functions(keys, names, lambda: self._functions))
         self._solver, function = self._build(functions)
         bounds = prepared.formulation.bounds.function
         self._run, self._bounds = ArrayFunction(function, kept=True), ArrayFunction(bounds, kept=True)
@@ -232,12 +227,8 @@ class Controller:
             ProblemError: A part of the problem has no C, such as cvodes.
             OSError: The folder cannot be written.
         """
-        place, form = Path(checked_path(folder)), self._prepared.formulation
-        try:
-            code, header = generate_c([self._build(self._functions)[1]], "controller")
-        except CompilerError as error:
-            raise ProblemError(f"problem {form.name!r} has no C: {error}", name="method", value=form.name) from error
-        transcription = self._prepared.transcription
+        place = Path(checked_path(folder))
+        form, transcription = self._prepared.formulation, self._prepared.transcription
         sizes = {
             "PARAMETERS": form.np,
             "CONTROLS": form.nu,
@@ -248,13 +239,9 @@ class Controller:
         for name, values in zip(("x", "lam_x", "lam_g"), self._state, strict=True):
             numbers = [f"{value:.17g}" for value in (*values, 0.0)]
             lines += [f"static double {name}[] = {{", *(f"  {number}," for number in numbers), "};"]
-        for name, labels in (("parameters", form.parameter_labels), ("controls", form.control_labels)):
-            lines.append(f"static const char *const {name}[] = {{{', '.join([*map(c_string, labels), '0'])}}};")
-        texts = {"controller.c": code, "controller.h": header, "start.h": "\n".join([*lines, ""])}
-        place.mkdir(parents=True, exist_ok=True)
-        for name, text in (texts | {"main.c": MAIN, "Makefile": MAKEFILE}).items():
-            write_text(place / name, text)
-        return place
+        lines += [c_strings("parameters", form.parameter_labels), c_strings("controls", form.control_labels), ""]
+        texts = {"start.h": "\n".join(lines), "main.c": MAIN, "Makefile": MAKEFILE}
+        return write_c(form, [self._build(self._functions)[1]], "controller", folder=place, texts=texts)
 
     def _build(self, functions: ProgramFunctions) -> tuple[Any, Any]:
         """Return the solver, and the casadi Function of a step, which solves again from another start if it fails."""
@@ -368,17 +355,6 @@ def program_functions(prepared: Any, hessian: str) -> ProgramFunctions:
         ca.Function("nlp_jac_fg", [x, p], [cost, slope, rows, jacobian], ["x", "p"], outputs),
         ca.Function("nlp_hess_l", [x, p, sigma, lam], [both], symbols, ["hess:gamma:x:x"]),
     )
-
-
-def compile_functions(functions: ProgramFunctions) -> ProgramFunctions:
-    """Return functions from a compiled library, or the functions themselves, with a warning, if compilation fails."""
-    texts = tuple(function_key(function) for function in functions)
-    try:
-        path = build_library(Library(texts, lambda: generate_c(functions, "unit", header=False)[0]))
-        return ProgramFunctions(*(ca.external(function.name(), str(path)) for function in functions))
-    except (CompilerError, RuntimeError) as error:
-        warn_interpreted(str(error))
-        return functions
 
 
 def gauss_newton_hessian(function: Any) -> Any:

@@ -70,7 +70,6 @@ def diagnosis(
     outcome: Outcome,
     arguments: dict[str, np.ndarray],
     *,
-    horizon: float,
     solution: Any,
     elastic: Elastic | None,
     attempts: Sequence[str],
@@ -79,12 +78,13 @@ def diagnosis(
     """Return an error that reports conflicting constraints and the largest residuals by constraint, state and time.
 
     Args:
-        outcome, arguments, horizon, solution: Of the first attempt, or of the one in which the time ran out.
+        outcome, arguments, solution: Of the first attempt, or of the one in which the time ran out.
         elastic: The plan with the smallest violation, or None.
         attempts: Result of every start, one line each.
         badly_scaled: Description of bad scaling, or "".
     """
     labels, fractions, value, violation = residuals(built, outcome.variables, arguments)
+    horizon = built.transcription.duration(built.formulation, outcome.variables, arguments["p"])
     message = outcome.message
     conflicts = () if elastic is None or badly_scaled else elastic.conflicts
     if badly_scaled:
@@ -259,9 +259,7 @@ class Elastic:
     conflicts: tuple[Conflict, ...]
 
 
-def elastic_plan(
-    built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
-) -> Elastic | None:
+def elastic_plan(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Elastic | None:
     """Return the plan that satisfies the dynamics and fixed ends, and violates the other constraints least.
 
     None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
@@ -271,7 +269,6 @@ def elastic_plan(
         outcome: Result of the failed solver.
         arguments: Arguments of the solver: x0, p and the bounds lbx, ubx, lbg, ubg.
         scales: Scales of the program.
-        horizon: The fixed final time, s; not used if it is free.
 
     Raises:
         Interrupted: Ctrl-C.
@@ -310,7 +307,7 @@ def elastic_plan(
         "ipopt": ELASTIC_IPOPT,
         "iteration_callback": progress,
     }
-    lower, upper = soft.limits(scaled)
+    lower, upper = soft.limits()
     progress.open(lower, upper)
     try:
         solver = ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
@@ -334,11 +331,9 @@ def elastic_plan(
     plan = np.asarray(result["x"].full()).ravel()[:n]
     rows_of_plan = np.asarray(program.values(plan, scaled["p"])[1].full()).ravel()
     plan_of_problem = plan * scales.variables
-    duration = horizon if transcription.horizon is None else float(plan_of_problem[transcription.horizon])
+    duration = transcription.duration(form, plan_of_problem, arguments["p"])
     units = np.concatenate([scales.rows, scales.variables])
-    return Elastic(
-        plan_of_problem, tuple(soft.conflicts(np.concatenate([rows_of_plan, plan]), scaled, duration, units))
-    )
+    return Elastic(plan_of_problem, tuple(soft.conflicts(np.concatenate([rows_of_plan, plan]), duration, units)))
 
 
 class _Soft:
@@ -350,22 +345,23 @@ class _Soft:
     def __init__(self, form: Formulation, transcription: Transcription, arguments: dict[str, np.ndarray]) -> None:
         places = form.bounds.places
         owner = np.array([*transcription.row_labels, *variable_labels(form, transcription)])
-        low, high = both_bounds(arguments)
+        self.bounds = low, high = both_bounds(arguments)
         declared = np.concatenate([places[kind] for kind in ("path", "start", "end")])
         is_soft = np.concatenate([np.isin(transcription.row_bounds, declared), arguments["lbx"] < arguments["ubx"]])
         self.lower = np.flatnonzero(is_soft & np.isfinite(low) & (owner != "horizon"))
         self.upper = np.flatnonzero(is_soft & np.isfinite(high))
         self.hard = np.flatnonzero(~is_soft[: transcription.n_rows])
-        self.labels, index = np.unique(owner[np.concatenate([self.lower, self.upper])], return_inverse=True)
+        both = np.concatenate([self.lower, self.upper])
+        self.labels, index = np.unique(owner[both], return_inverse=True)
         self.slack_of_lower, self.slack_of_upper = index[: len(self.lower)], index[len(self.lower) :]
         with np.errstate(invalid="ignore"):
             width = high - low
         bound = np.maximum(np.where(np.isfinite(low), np.abs(low), 0), np.where(np.isfinite(high), np.abs(high), 0))
         size = np.where(np.isfinite(width) & (width > 0), width, np.where(bound > 0, bound, 1.0))
         self.sizes = np.full(len(self.labels), np.inf)
-        np.minimum.at(self.sizes, index, size[np.concatenate([self.lower, self.upper])])
+        np.minimum.at(self.sizes, index, size[both])
         self.prices = 1 / self.sizes
-        self.prices[index[(low == high)[np.concatenate([self.lower, self.upper])]]] *= SETTINGS.equality
+        self.prices[index[(low == high)[both]]] *= SETTINGS.equality
         relaxed = is_soft[transcription.n_rows :]
         horizon = transcription.variable_role == "horizon"
         self.low = np.where(relaxed & ~horizon, -np.inf, arguments["lbx"])
@@ -387,26 +383,24 @@ class _Soft:
         signs = np.concatenate([np.ones((~of_rows).sum()), np.ones(len(self.lower)), -np.ones(len(self.upper))])
         return rows, sparse(at, columns, signs, (len(chosen), n + k))
 
-    def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds of the constraints of the elastic program."""
-        low, high = both_bounds(arguments)
+        low, high = self.bounds
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
-    def conflicts(
-        self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
-    ) -> list[Conflict]:
+    def conflicts(self, values: np.ndarray, horizon: float, units: np.ndarray) -> list[Conflict]:
         """Return the violated constraints in decreasing order of violation, each in its own unit."""
-        low, high = both_bounds(arguments)
+        low, high = self.bounds
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}
-        for side, index, slack in (
-            ("lower", self.lower, self.slack_of_lower),
-            ("upper", self.upper, self.slack_of_upper),
+        for side, sign, bounds, index, slack in (
+            ("lower", -1.0, low, self.lower, self.slack_of_lower),
+            ("upper", 1.0, high, self.upper, self.slack_of_upper),
         ):
-            bound = (low if side == "lower" else high)[index]
-            violation = bound - values[index] if side == "lower" else values[index] - bound
+            bound = bounds[index]
+            violation = sign * (values[index] - bound)
             for i in np.argsort(-violation):
                 j = int(slack[i])
                 if violation[i] <= RESOLVED_SHARE * self.sizes[j]:

@@ -64,116 +64,98 @@ class Collocation(DirectMethod):
         return 1 if self.control == "held" else self.degree
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
-        return _transcribe_collocation(self, form, staged)
+        d, nx, nu = self.degree, form.nx, form.nu
+        radau, piecewise_constant = self.scheme == "radau", self.control == "held"
+        mesh = self.fractions
+        n, width = len(mesh) - 1, np.diff(mesh)
+        stages = np.arange(n)
+        points = np.array(ca.collocation_points(d, self.scheme))
+        nodes = np.concatenate([[0.0], points])  # places of the state values in an interval
+        samples = np.array([0.5]) if piecewise_constant else points  # places of the control values
+        weights = quadrature_weights(points)
+        n_inner = d - 1 if radau else d  # Radau's last point is the end of the interval
 
+        build = TranscriptionBuilder(form, mesh, 0, n_inner * nx + len(samples) * nu, staged)
+        layout = build.layout
+        point_at = mesh[:-1, None] + width[:, None] * points  # fractions of the points, (n, d)
+        control_at = mesh[:-1, None] + width[:, None] * samples
 
-def _transcribe_collocation(method: Collocation, form: Formulation, staged: bool) -> Transcription:
-    """Return the transcription of a problem by collocation."""
-    d, nx, nu = method.degree, form.nx, form.nu
-    radau, piecewise_constant = method.scheme == "radau", method.control == "held"
-    mesh = method.fractions
-    n, width = len(mesh) - 1, np.diff(mesh)
-    stages = np.arange(n)
-    points = np.array(ca.collocation_points(d, method.scheme))
-    nodes = np.concatenate([[0.0], points])  # places of the state values in an interval
-    samples = np.array([0.5]) if piecewise_constant else points  # places of the control values
-    weights = quadrature_weights(points)
-    n_inner = d - 1 if radau else d  # Radau's last point is the end of the interval
+        # variables: states[k, j, i], entry i at place j of interval k, and controls[k, j, i]
+        inside = layout.interval[: n_inner * nx].T.reshape(n, n_inner, nx)
+        end = layout.node_end.T.reshape(n, 1, nx)
+        states = np.concatenate([layout.node[:, :-1].T.reshape(n, 1, nx), inside, *([end] if radau else [])], axis=1)
+        controls = layout.interval[n_inner * nx :].T.reshape(n, len(samples), nu)
+        for j in range(n_inner):
+            build.variables("state", states[:, j + 1].T, point_at[:, j], "state")
+        for j in range(len(samples)):
+            build.variables("control", controls[:, j].T, control_at[:, j], "control")
 
-    build = TranscriptionBuilder(form, mesh, 0, n_inner * nx + len(samples) * nu, staged)
-    layout = build.layout
-    point_at = mesh[:-1, None] + width[:, None] * points  # fractions of the points, (n, d)
-    control_at = mesh[:-1, None] + width[:, None] * samples
-
-    # variables: states[k, j, i], entry i at place j of interval k, and controls[k, j, i]
-    inside = layout.interval[: n_inner * nx].T.reshape(n, n_inner, nx)
-    end = layout.node_end.T.reshape(n, 1, nx)
-    states = np.concatenate([layout.node[:, :-1].T.reshape(n, 1, nx), inside, *([end] if radau else [])], axis=1)
-    controls = layout.interval[n_inner * nx :].T.reshape(n, len(samples), nu)
-    for j in range(n_inner):
-        build.variables("state", states[:, j + 1].T, point_at[:, j], "state")
-    for j in range(len(samples)):
-        build.variables("control", controls[:, j].T, control_at[:, j], "control")
-
-    # the dynamics at every point: sum_i l_i'(tau_j) X_i - h T f(X_j, u_j, t_j) = 0
-    stage_of, at = np.repeat(stages, d), point_at.ravel()
-    dynamics = build.rows(tuple(f"dynamics of {name}" for name in form.state_labels), None, stage_of, at)
-    derivative = differentiation_matrix(nodes)[1:]
-    for i in range(d + 1):
-        build.linear(dynamics, np.repeat(states[:, i], d, axis=0).T, np.tile(derivative[:, i], n)[None, :])
-    at_points = np.ones(len(form.path), dtype=bool)
-    if piecewise_constant:  # with a piecewise constant control an equality is imposed once per interval
-        at_points = ~form.path.equality
-    rows = form.path.select(at_points)
-    index = build.rows(rows.labels, rows.bounds, stage_of, at)
-    at_point = build.point(
-        states[:, 1:].reshape(n * d, nx).T,
-        (np.repeat(controls[:, 0], d, axis=0) if piecewise_constant else controls.reshape(n * d, nu)).T,
-        stage_of,
-    )
-    numbers = np.vstack([form.point_data(at), np.repeat(width, d), np.outer(width, weights).ravel()])
-    data = form.sym("d", len(numbers))  # fraction and signals, width, weight
-    function = form.point_function(
-        "point", data, data[-1] * form.T * form.running, ca.vertcat(-data[-2] * form.T * form.f, rows.expression)
-    )
-    build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
-
-    # the other places of the path constraints
-    without_control = ~form.path.uses_control
-    nearest = np.concatenate([controls[:, 0], controls[-1:, 0]]).T  # arbitrary controls, for rows without controls
-    if piecewise_constant:
-        start = controls[:, 0].T
-        build.path_rows(form.path.select(~without_control), layout.node[:, :-1], start, stages, at=mesh[:-1])
-        build.node_rows(form.path.select(without_control & form.path.equality), nearest)
-        if not radau:
-            build.path_rows(
-                form.path.select(~without_control & ~form.path.equality), layout.node_end, start, stages, at=mesh[1:]
-            )
-    inequality = form.path.select(without_control & ~form.path.equality)
-    build.node_rows(inequality, nearest, first_only=radau)
-    if not piecewise_constant:
-        build.node_rows(form.path.select(without_control & form.path.equality), nearest, first_only=True)
-
-    # the end of the interval, where it is not a point
-    at_one = lagrange(nodes, np.array([1.0]))[0]
-    continuity = dynamics[:, :0]
-    if not radau:
-        continuity = build.rows(tuple(f"continuity of {name}" for name in form.state_labels), None, stages, mesh[1:])
-        build.linear(continuity, layout.node_end, 1.0)
+        # the dynamics at every point: sum_i l_i'(tau_j) X_i - h T f(X_j, u_j, t_j) = 0
+        stage_of, at = np.repeat(stages, d), point_at.ravel()
+        dynamics = build.state_rows("dynamics", stage_of, at)
+        derivative = differentiation_matrix(nodes)[1:]
         for i in range(d + 1):
-            build.linear(continuity, states[:, i].T, -at_one[i])
+            build.linear(dynamics, np.repeat(states[:, i], d, axis=0).T, np.tile(derivative[:, i], n)[None, :])
+        path, equality, with_control = form.path, form.path.equality, form.path.uses_control
+        # with a piecewise constant control an equality is imposed once per interval
+        rows = path.select(~equality | (not piecewise_constant))
+        index = build.rows(rows.labels, rows.bounds, stage_of, at)
+        at_point = build.point(
+            states[:, 1:].reshape(n * d, nx).T,
+            (np.repeat(controls[:, 0], d, axis=0) if piecewise_constant else controls.reshape(n * d, nu)).T,
+            stage_of,
+        )
+        numbers = np.vstack([form.point_data(at), np.repeat(width, d), np.outer(width, weights).ravel()])
+        data = form.sym("d", len(numbers))  # fraction and signals, width, weight
+        function = form.point_function(
+            "point", data, data[-1] * form.T * form.running, ca.vertcat(-data[-2] * form.T * form.f, rows.expression)
+        )
+        build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
 
-    ends = (lagrange(samples, np.array([0.0]))[0], lagrange(samples, np.array([1.0]))[0])
-    build.ends(ends, controls[0], controls[-1], at_nodes=False)
+        # the other places of the path constraints
+        nearest = np.concatenate([controls[:, 0], controls[-1:, 0]]).T  # arbitrary controls, for rows without controls
+        if piecewise_constant:
+            start = controls[:, 0].T
+            build.path_rows(path.select(with_control), layout.node[:, :-1], start, stages, at=mesh[:-1])
+            build.node_rows(path.select(~with_control & equality), nearest)
+            if not radau:
+                build.path_rows(path.select(with_control & ~equality), layout.node_end, start, stages, at=mesh[1:])
+        build.node_rows(path.select(~with_control & ~equality), nearest, first_only=radau)
+        if not piecewise_constant:
+            build.node_rows(path.select(~with_control & equality), nearest, first_only=True)
 
-    # reported points: start, collocation points, and for Legendre the ends of intervals
-    by_interval = dynamics.T.reshape(n, d, nx)
-    scale = np.tile(-1.0 / weights, (n, 1))
-    if radau:
-        report = (np.concatenate([[0], stage_of]), np.concatenate([[0.0], np.tile(points, n)]))
-        report_states = np.vstack([states[0, :1], states[:, 1:].reshape(-1, nx)])
-        costate_rows = np.vstack([np.full((1, nx), -1), by_interval.reshape(-1, nx)])
-        costate_rows[::d] = -1  # at nodes the value of the next interval is more accurate
-        costate_scale = np.concatenate([[1.0], scale.ravel()])
-    else:
-        report = (np.concatenate([np.repeat(stages, d + 1), [n - 1]]), np.concatenate([np.tile(nodes, n), [1.0]]))
-        report_states = np.vstack([states.reshape(-1, nx), layout.node[:, -1]])
-        before = np.vstack([np.full((1, nx), -1), continuity.T[:-1]])[:, None, :]
-        costate_rows = np.vstack([np.concatenate([before, by_interval], axis=1).reshape(-1, nx), continuity.T[-1:]])
-        at_nodes = np.full((n, 1), -1.0)
-        costate_scale = np.concatenate([np.hstack([at_nodes, scale]).ravel(), [-1.0]])
+        # the end of the interval, where it is not a point
+        at_one = lagrange(nodes, np.array([1.0]))[0]
+        continuity = dynamics[:, :0]
+        if not radau:
+            continuity = build.state_rows("continuity", stages, mesh[1:])
+            build.linear(continuity, layout.node_end, 1.0)
+            for i in range(d + 1):
+                build.linear(continuity, states[:, i].T, -at_one[i])
 
-    by_point, by_sample = states.reshape(n, -1).T, controls.reshape(n, -1).T
-    interpolants = Interpolants(mesh, nodes, by_point, mesh, samples, by_sample, np.zeros((0, n)))
-    costate_nodes = report[0] + (report[1] == 1.0)
-    return build.finish(
-        report,
-        report_states,
-        costate_rows,
-        costate_nodes=costate_nodes,
-        costate_scale=costate_scale,
-        interpolants=interpolants,
-    )
+        at_start, at_end = lagrange(samples, np.array([0.0, 1.0]))
+        build.ends((controls[0], at_start), (controls[-1], at_end))
+
+        # reported points: start, collocation points, and for Legendre the ends of intervals
+        by_interval = dynamics.T.reshape(n, d, nx)
+        scale = np.tile(-1.0 / weights, (n, 1))
+        if radau:
+            report = (np.concatenate([[0], stage_of]), np.concatenate([[0.0], np.tile(points, n)]))
+            report_states = np.vstack([states[0, :1], states[:, 1:].reshape(-1, nx)])
+            costate_rows = np.vstack([np.full((1, nx), -1), by_interval.reshape(-1, nx)])
+            costate_rows[::d] = -1  # at nodes the value of the next interval is more accurate
+            costate_scale = np.concatenate([[1.0], scale.ravel()])
+        else:
+            report = (np.concatenate([np.repeat(stages, d + 1), [n - 1]]), np.concatenate([np.tile(nodes, n), [1.0]]))
+            report_states = np.vstack([states.reshape(-1, nx), layout.node[:, -1]])
+            before = np.vstack([np.full((1, nx), -1), continuity.T[:-1]])[:, None, :]
+            costate_rows = np.vstack([np.concatenate([before, by_interval], axis=1).reshape(-1, nx), continuity.T[-1:]])
+            at_nodes = np.full((n, 1), -1.0)
+            costate_scale = np.concatenate([np.hstack([at_nodes, scale]).ravel(), [-1.0]])
+
+        by_point, by_sample = states.reshape(n, -1).T, controls.reshape(n, -1).T
+        interpolants = Interpolants(mesh, nodes, by_point, mesh, samples, by_sample, np.zeros((0, n)))
+        return build.finish(report, report_states, costate_rows, costate_scale=costate_scale, interpolants=interpolants)
 
 
 @dataclass(frozen=True)
@@ -212,71 +194,53 @@ class MultipleShooting(DirectMethod):
         return 1 if self.control == "held" else 2
 
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
-        return _transcribe_shooting(self, form, staged)
+        nx, nu = form.nx, form.nu
+        mesh = self.fractions
+        n, width = len(mesh) - 1, np.diff(mesh)
+        stages = np.arange(n)
+        linear = self.control == "linear"
+        build = TranscriptionBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
+        layout = build.layout
+        first, last = layout.node[:nx, :-1], layout.node_end[:nx]
+        if linear:
+            # at both ends of every interval, (2, nu, n)
+            controls = np.stack([layout.node[nx:, :-1], layout.node_end[nx:]])
+            at_nodes = layout.node[nx:]
+        else:
+            build.variables("control", layout.interval, mesh[:-1] + 0.5 * width, "control")
+            controls = layout.interval[None]
+            at_nodes = np.column_stack([layout.interval, layout.interval[:, -1]])
 
+        # the end of every interval: x_end - F(x, u) = 0
+        rows = build.state_rows("continuity", stages, mesh[1:])
+        build.linear(rows, last, 1.0)
+        variables = build.point(first, controls.reshape(-1, n), stages)
+        data = np.vstack([mesh[:-1], width])
+        build.blocks.append(Block(interval_function(form, self), variables, data, rows))
 
-def _transcribe_shooting(method: MultipleShooting, form: Formulation, staged: bool) -> Transcription:
-    """Return the transcription of a problem by multiple shooting."""
-    nx, nu = form.nx, form.nu
-    mesh = method.fractions
-    n, width = len(mesh) - 1, np.diff(mesh)
-    stages = np.arange(n)
-    linear = method.control == "linear"
-    build = TranscriptionBuilder(form, mesh, nu if linear else 0, 0 if linear else nu, staged)
-    layout = build.layout
-    first, last = layout.node[:nx, :-1], layout.node_end[:nx]
-    if linear:
-        controls = np.stack([layout.node[nx:, :-1], layout.node_end[nx:]])  # at both ends of the interval, (2, nu, n)
-    else:
-        build.variables("control", layout.interval, mesh[:-1] + 0.5 * width, "control")
-        controls = layout.interval[None]
+        # path constraints: at both ends of an interval where they contain a control, else at the nodes
+        path, with_control = form.path, form.path.uses_control
+        if linear:
+            build.node_rows(path, at_nodes)
+        else:
+            build.path_rows(path.select(with_control), first, layout.interval, stages, at=mesh[:-1])
+            build.path_rows(path.select(with_control & ~path.equality), last, layout.interval, stages, at=mesh[1:])
+            build.node_rows(path.select(~with_control), at_nodes)
+        build.ends((at_nodes[:, :1].T, np.ones(1)), (at_nodes[:, -1:].T, np.ones(1)))
 
-    # the end of every interval: x_end - F(x, u) = 0
-    rows = build.rows(tuple(f"continuity of {name}" for name in form.state_labels), None, stages, mesh[1:])
-    build.linear(rows, last, 1.0)
-    variables = build.point(first, controls.reshape(-1, n), stages)
-    data = np.vstack([mesh[:-1], width])
-    build.blocks.append(Block(interval_function(form, method), variables, data, rows))
-
-    # path constraints: at both ends of an interval where they contain a control, else at the nodes
-    without_control = ~form.path.uses_control
-    if linear:
-        build.node_rows(form.path, layout.node[nx:])
-        ends = (np.ones(1), np.ones(1))
-        build.ends(ends, layout.node[nx:, 0][None], layout.node[nx:, -1][None], at_nodes=True)
-    else:
-        controls_inside = layout.interval
-        build.path_rows(form.path.select(~without_control), first, controls_inside, stages, at=mesh[:-1])
-        build.path_rows(
-            form.path.select(~without_control & ~form.path.equality), last, controls_inside, stages, at=mesh[1:]
+        report = (np.concatenate([stages, [n - 1]]), np.concatenate([np.zeros(n), [1.0]]))
+        costate_rows = np.vstack([np.full((1, nx), -1), rows.T])
+        costate_scale = np.concatenate([[1.0], np.full(n, -1.0)])
+        breaks = np.append((mesh[:-1, None] + width[:, None] * np.arange(self.steps) / self.steps).ravel(), 1.0)
+        inputs, control_nodes = np.vstack([first, *controls]), np.array([0.0, 1.0] if linear else [0.5])
+        dense = dense_function(form, self)
+        interpolants = Interpolants(breaks, THIRDS, inputs, mesh, control_nodes, np.vstack([*controls]), data, dense)
+        return build.finish(
+            report, layout.node[:nx].T, costate_rows, costate_scale=costate_scale, interpolants=interpolants
         )
-        build.node_rows(form.path.select(without_control), np.column_stack([controls_inside, controls_inside[:, -1]]))
-        build.ends((np.ones(1), np.ones(1)), controls_inside[:, 0][None], controls_inside[:, -1][None], at_nodes=False)
-
-    report = (np.concatenate([stages, [n - 1]]), np.concatenate([np.zeros(n), [1.0]]))
-    costate_rows = np.vstack([np.full((1, nx), -1), rows.T])
-    costate_scale = np.concatenate([[1.0], np.full(n, -1.0)])
-    breaks = np.append((mesh[:-1, None] + width[:, None] * np.arange(method.steps) / method.steps).ravel(), 1.0)
-    inputs, control_nodes = np.vstack([first, *controls]), np.array([0.0, 1.0] if linear else [0.5])
-    dense = dense_function(form, method)
-    interpolants = Interpolants(breaks, THIRDS, inputs, mesh, control_nodes, np.vstack([*controls]), data, dense)
-    nodes = np.arange(n + 1)
-    return build.finish(
-        report,
-        layout.node[:nx].T,
-        costate_rows,
-        costate_nodes=nodes,
-        costate_scale=costate_scale,
-        interpolants=interpolants,
-    )
 
 
 # ---- integration of one interval -----------------------------------------------------------------------------
-
-
-def n_controls_of(form: Formulation, method: MultipleShooting) -> int:
-    """Return the number of control variables that act in an interval of multiple shooting."""
-    return form.nu * (2 if method.control == "linear" else 1)
 
 
 def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) -> Any:
@@ -292,7 +256,7 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
     Its values are the running cost and minus the end state. It is the function of a :class:`Block` with variables v,
     data d (start and width of the interval) and parameters p.
     """
-    nw = n_controls_of(form, method)
+    nw = form.nu * method.control_order
     step, flat = step_function(form, method)
     sym = (ca.SX if flat else ca.MX).sym
     v, d = sym("v", form.nx + nw + form.horizon_is_free), sym("d", 2)
@@ -317,7 +281,7 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
         return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
     sym = symbols_of(function).sym  # MX if the dynamics need signals
-    x, w, d, i = sym("x", form.nx), sym("w", n_controls_of(form, method)), sym("d", 2), sym("i")
+    x, w, d, i = sym("x", form.nx), sym("w", form.nu * method.control_order), sym("d", 2), sym("i")
     horizon, p = sym("T"), sym("p", form.np)
     h = d[1] * horizon / method.steps
 
@@ -340,7 +304,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
     (0..1) of the interval, side by side.
     """
     sym = form.sym
-    nw = n_controls_of(form, method)
+    nw = form.nu * method.control_order
     x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
     w, s, h, horizon, p = (q[:nw], q[nw], q[nw + 1], q[nw + 2], q[nw + 3 :])
     function = form.function("f", [form.f, form.running], ["f", "running"])
@@ -358,7 +322,7 @@ def dense_function(form: Formulation, method: MultipleShooting) -> Any:
 
     It maps ([x; w], d, T, p), as in :func:`step_function`, to the states at the `THIRDS` of each integration step.
     """
-    v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
+    v, d = ca.MX.sym("v", form.nx + form.nu * method.control_order), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)
     if method.integrator == "cvodes":

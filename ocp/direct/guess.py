@@ -15,8 +15,8 @@ import numpy as np
 from ocp.curves import rk4_step
 from ocp.direct.assembly import Transcription
 from ocp.errors import ProblemError, error_names, require
-from ocp.problem.formulation import Bounds, Formulation
-from ocp.problem.values import numeric, table
+from ocp.problem.formulation import Bounds, Formulation, total
+from ocp.problem.values import middle_horizon, numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -63,8 +63,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
     for role, declared in (("state", form.states), ("control", form.controls)):
         chosen = transcription.variable_role == role
         fractions, slot = np.unique(transcription.variable_fraction[chosen], return_inverse=True)
-        size = max((entries.stop for entries in declared.values()), default=0)
-        table = np.zeros((len(fractions), size))
+        table = np.zeros((len(fractions), total(declared)))
         for name, entries in declared.items():
             value = guesses.get(name)
             if name in curves:
@@ -201,7 +200,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
     low, high = bounds[0][place], bounds[1][place]
     if form.horizon_guess is not None:
         return float(np.clip(form.horizon_guess, low, high))
-    return float(np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high))
+    return middle_horizon(low, high)
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
@@ -286,7 +285,7 @@ def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray,
     """
     state, control = (transcription.variable_role == role for role in ("state", "control"))
     fractions, slot = np.unique(transcription.variable_fraction[state], return_inverse=True)
-    horizon = float(form.horizon_at(p) if transcription.horizon is None else point[transcription.horizon])
+    horizon = transcription.duration(form, point, p)
     # controls at the beginning, middle and end of every step
     places = np.concatenate([fractions[:-1], (fractions[:-1] + fractions[1:]) / 2, fractions[1:]])
     values = np.zeros((form.nu, len(places)))

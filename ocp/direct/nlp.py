@@ -286,11 +286,6 @@ def last_line(error: BaseException) -> str:
     return str(error).strip().splitlines()[-1]
 
 
-def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> float:
-    """Return the horizon (final time) of a solver's result, s, whether the horizon is fixed or free."""
-    return float(form.horizon_at(p) if transcription.horizon is None else outcome.variables[transcription.horizon])
-
-
 def solution_of(
     form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, *, p: np.ndarray, **fields: Any
 ) -> Solution:
@@ -300,7 +295,7 @@ def solution_of(
         fields: Further fields of the solution: method, start, seconds.
     """
     v = outcome.variables
-    horizon = horizon_of(form, transcription, outcome, p)
+    horizon = transcription.duration(form, v, p)
     states, controls = transcription.interpolants(v, p, horizon)
     interval, place = transcription.report
     mesh = transcription.mesh
@@ -308,7 +303,7 @@ def solution_of(
     at[-1] = 1.0
     costates = costates_of(program, transcription, outcome, p)
     gradient = _cost_gradient(form, program, transcription, outcome, p) if form.np else np.zeros(0)
-    x, u = v[transcription.report_states], controls_at(controls, transcription, interval, place)
+    x, u = v[transcription.report_states], controls.within(interval, place)
     return Solution(
         name=form.name,
         solver=outcome.solver,
@@ -358,8 +353,14 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
     before = np.bincount(columns, weights=terms, minlength=transcription.size) + running
     after[transcription.end] = -before[transcription.end]
     at_node = transcription.costate_rows < 0
-    costates[at_node] = after[transcription.nodes.T[transcription.costate_nodes]][at_node]
+    costates[at_node] = after[transcription.nodes.T[report_nodes(transcription)]][at_node]
     return np.asarray(costates)
+
+
+def report_nodes(transcription: Transcription) -> np.ndarray:
+    """Return the index of the last node up to each reported point. Shape (M,)."""
+    interval, place = transcription.report
+    return np.asarray(interval + (place == 1.0))
 
 
 def _cost_gradient(
@@ -379,18 +380,9 @@ def _cost_gradient(
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
     """Return the piecewise polynomial through the reported costates, with both ends of each interval as nodes."""
-    interval, place = transcription.report
-    n = len(transcription.mesh) - 1
-    starts = np.searchsorted(interval + (place == 1.0), np.arange(n))
-    width = starts[1] - starts[0] if n > 1 else len(interval) - 1
+    n, node_of = len(transcription.mesh) - 1, report_nodes(transcription)
+    starts = np.searchsorted(node_of, np.arange(n))
+    width = starts[1] - starts[0] if n > 1 else len(node_of) - 1
     index = starts[:, None] + np.arange(width + 1)
-    nodes = np.append(place[(interval + (place == 1.0)) == 0], 1.0)
+    nodes = np.append(transcription.report[1][node_of == 0], 1.0)
     return PiecewisePolynomial(transcription.mesh, nodes, costates[index])
-
-
-def controls_at(controls: Any, transcription: Transcription, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the controls at the reported points; at a jump, the value of the interval to which the point belongs."""
-    if len(controls.breaks) == len(transcription.mesh):
-        return np.asarray(controls.within(interval, place))
-    mesh = transcription.mesh
-    return np.asarray(controls(mesh[interval] + np.diff(mesh)[interval] * place))

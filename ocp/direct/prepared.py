@@ -21,20 +21,12 @@ from ocp.direct.code_generation import block_derivatives, write_controller
 from ocp.direct.controller import Controller, ControllerSettings
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
 from ocp.direct.guess import STARTS, alternative_starts, displace, guessed_names, initial_point, shifted_indices
-from ocp.direct.nlp import (
-    SOLVERS,
-    Outcome,
-    broken_down,
-    build_solver,
-    call_solver,
-    horizon_of,
-    iteration_limit,
-    solution_of,
-)
+from ocp.direct.nlp import SOLVERS, Outcome, broken_down, build_solver, call_solver, iteration_limit, solution_of
 from ocp.direct.scaling import (
     Pattern,
     PredeterminedVariables,
     Scales,
+    Sizes,
     compute_scales,
     scaled_program,
     scaling_fault,
@@ -253,7 +245,7 @@ class Prepared:
             point = guess.variables[shifted_indices(transcription, shift)[0]]
         names = guessed_names(form, guess)
         if start != "guess":
-            point = displace(transcription, point, self._sizes(point, names, bounds, p))
+            point = displace(transcription, point, self._sizes(point, names, bounds, p).of_variables(transcription))
         first = self._attempt(start, point, names, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
@@ -269,12 +261,11 @@ class Prepared:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
         point = decisive.arguments["x0"]
-        sizes = sizes_along(self._pattern, point, decisive.names, bounds=bounds, p=p)
+        sizes = self._sizes(point, decisive.names, bounds, p)
         raise diagnosis(
             self,
             decisive.outcome,
             decisive.arguments,
-            horizon=horizon_of(form, transcription, decisive.outcome, p),
             solution=decisive.solution,
             elastic=elastic,
             attempts=[str(attempt) for attempt in attempts],
@@ -291,7 +282,7 @@ class Prepared:
         if first.is_final:
             return attempts
         limits, p = (arguments["lbx"], arguments["ubx"]), arguments["p"]
-        sizes = self._sizes(x0, first.names, bounds, p)
+        sizes = self._sizes(x0, first.names, bounds, p).of_variables(self.transcription)
         for start, point in alternative_starts(self.formulation, self.transcription, x0, p, bounds=limits, sizes=sizes):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
@@ -307,9 +298,8 @@ class Prepared:
 
         On Ctrl-C, Interrupted is raised with the plan of that run.
         """
-        horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
-            return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
+            return elastic_plan(self, first.outcome, first.arguments, first.scales)
         except Interrupted as error:
             raise Interrupted(str(error), first.solution) from error
 
@@ -395,15 +385,15 @@ class Prepared:
         """Return the scales of the program for an initial point; ``names`` are variables with meaningful values."""
         if not self._scaling:
             return unit_scales(self.transcription)
-        scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)
+        scales = compute_scales(self._pattern, self._sizes(point, names, bounds, p), point, p)
         if getattr(self.method, "integrator", "") == "cvodes":
             # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
 
-    def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> np.ndarray:
-        """Return the typical size of each variable at a guess; ``names`` are variables with meaningful values."""
-        return sizes_along(self._pattern, point, names, bounds=bounds, p=p).of_variables(self.transcription)
+    def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Sizes:
+        """Return the typical sizes of the variables at a guess; ``names`` are variables with meaningful values."""
+        return sizes_along(self._pattern, point, names, bounds=bounds, p=p)
 
     @property
     def _variable_names(self) -> set[str]:

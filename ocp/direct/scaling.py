@@ -27,6 +27,7 @@ from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.errors import SolverStatus
 from ocp.problem.formulation import Bounds, Formulation
+from ocp.problem.values import dependence
 from ocp.tolerances import ROUNDING_SHARE
 
 SIDES = ("lbx", "ubx", "lbg", "ubg")
@@ -189,7 +190,7 @@ def sizes_along(
     for end in ("initial", "terminal"):
         index = places[end]
         largest[:nx] = np.maximum(largest[:nx], np.where(low[index] == high[index], np.abs(low[index]), 0.0))
-    horizon = float(form.horizon_at(p) if transcription.horizon is None else point[transcription.horizon])
+    horizon = transcription.duration(form, point, p)
     if transcription.horizon is None or "horizon" in intended:
         largest[-1] = horizon
     index = np.concatenate([places["state"], places["control"], places["horizon"]])
@@ -383,13 +384,8 @@ def uncontrolled_states(form: Formulation) -> np.ndarray:
     """Return which states depend only on the initial state and time, not on controls. Shape (nx,), bool."""
     if form.horizon_is_free:
         return np.zeros(form.nx, dtype=bool)
-
-    def uses(symbol: ca.SX | ca.MX) -> np.ndarray:
-        pattern = np.asarray(ca.DM(ca.jacobian_sparsity(form.f, symbol), 1).full()) != 0
-        return np.asarray(pattern.reshape(form.nx, -1))
-
-    independent = form.initial_is_fixed & ~uses(form.u).any(axis=1)
-    states = uses(form.x)
+    independent = form.initial_is_fixed & ~dependence(form.f, form.u).any(axis=1)
+    states = dependence(form.f, form.x)
     while (dependent := independent & (states & ~independent).any(axis=1)).any():
         independent = independent & ~dependent
     return np.asarray(independent)

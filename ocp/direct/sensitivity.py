@@ -15,14 +15,14 @@ from ocp.direct.active_set import RESOLVED, Conditions, conditions
 from ocp.direct.assembly import Program, Transcription, assemble
 from ocp.direct.diagnosis import variable_names
 from ocp.direct.discretisation import Collocation, MultipleShooting
-from ocp.direct.nlp import Outcome, controls_at
+from ocp.direct.nlp import Outcome
 from ocp.direct.scaling import Pattern, compute_scales, sizes_along
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
 from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.values import symbols_of
 from ocp.solution import Solution
-from ocp.solution_data import Sensitivity
+from ocp.solution_data import Sensitivity, entry_named
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 """Classes of the direct methods by the name of the type that a solution stores."""
@@ -40,9 +40,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
             problem; or active limits that contradict each other when the parameter changes.
     """
     form, transcription, program = program_of(solution)
-    if not isinstance(name, str) or name not in form.parameters:
-        raise require.unknown("parameter", name, form.parameters)
-    place = form.parameters[name]
+    place = entry_named("parameter", name, form.parameters)
     columns = list(range(place.start, place.stop))
     v, lam, p = solution.variables, solution.multipliers, form.parameter_vector(solution.parameters)
     bounds = bounds_to_solve(form, p)
@@ -213,13 +211,12 @@ def control_rates(transcription: Transcription, solution: Solution, p: np.ndarra
 
     The controls are linear in the variables, so that differences are exact.
     """
-    interval, place = transcription.report
     v, columns = solution.variables, []
     for direction in dv.T:
         step = max(1.0, float(np.abs(v).max())) / max(float(np.abs(direction).max()), 1e-300)
         curves = [
             transcription.interpolants(v + sign * step * direction, p, solution.horizon)[1] for sign in (1.0, -1.0)
         ]
-        up, down = (controls_at(curve, transcription, interval, place) for curve in curves)
+        up, down = (curve.within(*transcription.report) for curve in curves)
         columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)

@@ -9,18 +9,20 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from models.checks import NOT_NUMBERS, floats
 from models.files import INPUT_LIMITS
 from ocp.direct.assembly import Block, Interpolants, Stages, Transcription
 from ocp.errors import ProblemError, error_names, require
 from ocp.problem.formulation import Formulation, Rows
 from ocp.problem.values import numeric
 from ocp.tolerances import ROUNDING_SHARE
+
+WeightedControls: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Indices of control variables, shape (c, nu), and the weights of their sum, shape (c,)."""
 
 
 @dataclass(frozen=True)
@@ -52,38 +54,29 @@ class Layout:
     stage_controls: int = 0
 
 
-def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Return the layout of variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
-    stride = node_size + interval_size
-    grid = np.arange(intervals * stride).reshape(intervals, stride).T
-    node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
-    size = intervals * stride + node_size
-    horizon = np.full(intervals + 1, size) if free_horizon else None
-    initial = np.column_stack([node[:, 0], node[:, 0]])
-    return Layout(size + free_horizon, node, node[:, 1:], grid[node_size:], horizon, initial)
-
-
-def _staged_layout(
-    intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
+def variable_layout(
+    intervals: int, node_size: int, interval_size: int, free_horizon: bool, *, staged: bool, keep_initial: bool
 ) -> Layout:
-    """Return the order of variables in which those of a mesh interval, with a copy of its end, are consecutive."""
-    carried = node_size + free_horizon + node_size * keep_initial
-    inputs = interval_size + node_size
+    """Return the layout of the variables in the order node 0, interval 0, node 1, ..., node N.
+
+    The plain layout ends with a free horizon. In the staged layout each node also carries the horizon and, with
+    ``keep_initial``, the start, and each interval a copy of its end.
+    """
+    carried = node_size + staged * (free_horizon + node_size * keep_initial)
+    inputs = interval_size + staged * node_size
     stride = carried + inputs
+    size = intervals * stride + carried
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     nodes = np.column_stack([grid[:carried], intervals * stride + np.arange(carried)])
+    node, interval = nodes[:node_size], grid[carried : carried + interval_size]
+    if not staged:
+        horizon = np.full(intervals + 1, size) if free_horizon else None
+        return Layout(size + free_horizon, node, node[:, 1:], interval, horizon, node[:, [0, 0]])
+    horizon = nodes[node_size] if free_horizon else None
     node_end = grid[carried + interval_size :]
-    start = nodes[node_size + free_horizon :] if keep_initial else nodes[:node_size]
-    return Layout(
-        intervals * stride + carried,
-        nodes[:node_size],
-        node_end,
-        grid[carried : carried + interval_size],
-        nodes[node_size] if free_horizon else None,
-        start[:, [0, -1]],
-        (nodes[:, 1:], np.vstack([node_end, nodes[node_size:, :-1]])),
-        inputs,
-    )
+    initial = (nodes[node_size + free_horizon :] if keep_initial else node)[:, [0, -1]]
+    joins = nodes[:, 1:], np.vstack([node_end, nodes[node_size:, :-1]])
+    return Layout(size, node, node_end, interval, horizon, initial, joins, inputs)
 
 
 @dataclass
@@ -114,8 +107,8 @@ class TranscriptionBuilder:
     def __post_init__(self) -> None:
         form = self.formulation
         size = form.nx + self.node_controls
-        shape = (self.intervals, size, self.interval_size, form.horizon_is_free)
-        self.layout: Layout = _staged_layout(*shape, form.ties_ends) if self.staged else plain_layout(*shape)
+        sizes, ties = (self.intervals, size, self.interval_size), form.ties_ends
+        self.layout = variable_layout(*sizes, form.horizon_is_free, staged=self.staged, keep_initial=ties)
         self.variable_bounds = np.full(self.layout.size, form.bounds.places["free"][0])
         self.variable_role = np.full(self.layout.size, "", dtype="<U8")
         self.variable_entry = np.zeros(self.layout.size, dtype=int)
@@ -204,6 +197,10 @@ class TranscriptionBuilder:
         self._inside.append(np.full(m * places, not ends))
         return first + np.arange(m * places).reshape(places, m).T
 
+    def state_rows(self, kind: str, stages: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Allocate equations of a kind, such as "dynamics", of all states at each of K points; see :meth:`rows`."""
+        return self.rows(tuple(f"{kind} of {label}" for label in self.formulation.state_labels), None, stages, at)
+
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
         """Add linear terms ``values * variable[columns]`` to constraints; the arrays are broadcast together."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
@@ -234,34 +231,25 @@ class TranscriptionBuilder:
         if not first_only:
             self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], at=self.mesh[1:])
 
-    def ends(
-        self, basis: tuple[np.ndarray, np.ndarray], first: np.ndarray, last: np.ndarray, *, at_nodes: bool
-    ) -> None:
+    def ends(self, first: WeightedControls, last: WeightedControls) -> None:
         """Declare start and end constraints and the terminal cost.
 
         Args:
-            basis: Weights (c,) of the control values of the first (last) interval that give the control at the start
-                (end).
-            first, last: Control variables of the first and the last interval. Shape (c, nu).
-            at_nodes: Whether the controls are node variables.
+            first, last: Control variables of the first and the last interval, and the weights with which they give the
+                control at the start and at the end.
         """
-        form, layout, nx = self.formulation, self.layout, self.formulation.nx
+        form = self.formulation
         if len(form.start):
-            self._end_block(form.start, 0, layout.node[:nx, 0], (basis[0], first), None, 0)
-        conditions = ca.vertcat(form.end.expression, form.terminal)
-        if self.staged and not at_nodes and (ca.depends_on(conditions, form.u) or ca.depends_on(conditions, form.u0)):
+            self._end_block(form.start, 0, 0, first, first)
+        controls = ca.vertcat(form.u, form.u0)
+        is_constrained = ca.depends_on(ca.vertcat(form.end.expression, form.terminal), controls)
+        if self.staged and not self.node_controls and is_constrained:
             text = "a stage-ordered program cannot constrain the control at the end; use ipopt"
             raise ProblemError(text, name="control")
-        self._end_block(form.end, form.terminal, layout.node[:nx, -1], (basis[1], last), (basis[0], first), 1)
+        self._end_block(form.end, form.terminal, 1, last, first)
 
     def _end_block(
-        self,
-        rows: Rows,
-        cost: Any,
-        states: np.ndarray,
-        controls: tuple[np.ndarray, np.ndarray],
-        initial: tuple[np.ndarray, np.ndarray] | None,
-        place: int,
+        self, rows: Rows, cost: Any, place: int, controls: WeightedControls, initial: WeightedControls
     ) -> None:
         """Add the block with the constraints and the cost at the start (place 0) or the end (place 1) of the horizon.
 
@@ -272,13 +260,13 @@ class TranscriptionBuilder:
         stage = self.intervals if place else 0
         used = ca.vertcat(rows.expression, cost)
         # symbol of the problem, its variables, and their weights
-        inputs = [(form.x, states, np.ones(1))]
+        inputs = [(form.x, layout.node[:nx, stage], np.ones(1))]
         if nu and ca.depends_on(used, form.u):
-            inputs.append((form.u, controls[1], controls[0]))
-        if initial is not None and ca.depends_on(used, form.x0):
+            inputs.append((form.u, *controls))
+        if ca.depends_on(used, form.x0):
             inputs.append((form.x0, layout.initial[:nx, place], np.ones(1)))
-        if initial is not None and nu and ca.depends_on(used, form.u0):
-            start_controls = (layout.initial[nx:, place], np.ones(1)) if self.node_controls else initial[::-1]
+        if nu and ca.depends_on(used, form.u0):
+            start_controls = (layout.initial[nx:, place], np.ones(1)) if self.node_controls else initial
             inputs.append((form.u0, *start_controls))
         if layout.horizon is not None:
             inputs.append((form.T, layout.horizon[[stage]], np.ones(1)))
@@ -309,7 +297,6 @@ class TranscriptionBuilder:
         report_states: np.ndarray,
         costate_rows: np.ndarray,
         *,
-        costate_nodes: np.ndarray,
         costate_scale: np.ndarray,
         interpolants: Interpolants,
     ) -> Transcription:
@@ -344,7 +331,6 @@ class TranscriptionBuilder:
             report=report,
             report_states=report_states,
             costate_rows=np.where(costate_rows < 0, -1, number[costate_rows]),
-            costate_nodes=costate_nodes,
             costate_scale=costate_scale,
             interpolants=interpolants,
             stages=stages,
@@ -439,11 +425,8 @@ class MeshedMethod(ABC):
         if self.mesh is None:
             return
         details: dict[str, Any] = {"name": "mesh", "value": self.mesh}
-        try:
-            mesh = floats(self.mesh)
-        except NOT_NUMBERS as error:
-            text = f"{name_of_method}: mesh must be fractions from 0 to 1, not {self.mesh!r}"
-            raise ProblemError(text, **details) from error
+        with error_names("mesh"):
+            mesh = numeric(f"{name_of_method}: mesh", self.mesh)
         if mesh.shape != (self.intervals + 1,):
             text = f"{name_of_method}: mesh has {mesh.size} entries, {self.intervals + 1} expected (fractions 0 to 1)"
             raise ProblemError(text, **details)

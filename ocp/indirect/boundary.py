@@ -168,12 +168,8 @@ class BoundaryProblem:
 
         Shapes (2 nx, places) and (2,).
         """
-        try:
-            with casadi_silenced():
-                states, integrals = segment(y, q)
-            return np.asarray(states.full()), np.asarray(integrals.full()).reshape(-1)
-        except RuntimeError:
-            return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
+        states, integrals = evaluate(segment, y, q)
+        return states, integrals.ravel()
 
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """Return states and costates at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
@@ -190,11 +186,7 @@ class BoundaryProblem:
         if self.backward:
             symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
             chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(self._integrate_backwards(*symbols, arcs)))])
-            try:
-                with casadi_silenced():
-                    y = np.asarray(chain(z, data).full())
-            except RuntimeError:  # the integration failed
-                y = np.full((2 * form.nx, total + 1), np.nan)
+            (y,) = evaluate(chain, z, data)
         else:
             at = self.layout(arcs)
             y = z[at["y"]].reshape(total + 1, 2 * form.nx).T
@@ -203,6 +195,15 @@ class BoundaryProblem:
         w, at_end, numbers = ca.MX.sym("w", switches.size), ca.MX.sym("T"), ca.MX.sym("data", data.size)
         inputs = ca.Function("q", [w, at_end, numbers], [self._segment_data(w, at_end, numbers, arcs)])
         return y, np.asarray(inputs(switches, horizon, data).full()), switches, horizon
+
+
+def evaluate(function: Any, *arguments: np.ndarray, failed: float = np.nan) -> list[np.ndarray]:
+    """Return the outputs of a CasADi function as arrays, filled with ``failed`` if an integrator in it fails."""
+    try:
+        with casadi_silenced():
+            return [np.asarray(output.full()) for output in function.call(arguments)]
+    except RuntimeError:
+        return [np.full(function.size_out(i), failed) for i in range(function.n_out())]
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
@@ -275,6 +276,9 @@ class NewtonSettings:
     descent: float = 1e-4
 
 
+SETTINGS = NewtonSettings()
+
+
 @dataclass(frozen=True)
 class NewtonResult:
     """Last iterate of Newton's method, its residual, the number of steps, and the status with a message."""
@@ -292,31 +296,21 @@ class NewtonResult:
 
 
 def newton(
-    system: tuple[Any, ...],
-    start: np.ndarray,
-    data: np.ndarray,
-    *,
-    scale: float,
-    tolerance: float,
-    settings: NewtonSettings = NewtonSettings(),
+    system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, *, scale: float, tolerance: float
 ) -> NewtonResult:
     """Solve a sparse nonlinear system by damped Newton steps, each halved until the residual decreases."""
     residual, jacobian = system
 
-    def evaluate(z: np.ndarray) -> np.ndarray:
-        try:
-            with casadi_silenced():
-                return np.asarray(residual(z, data).full()).reshape(-1)
-        except RuntimeError:  # the integration failed: the worst residual
-            return np.full(z.size, np.inf)
+    def residual_at(z: np.ndarray) -> np.ndarray:
+        return evaluate(residual, z, data, failed=np.inf)[0].ravel()
 
-    z, value = start, evaluate(start)
+    z, value = start, residual_at(start)
     if value.size != start.size:
         words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
         raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
     polished, stopped = False, None
     with stop_requests_polled():
-        for steps in range(settings.steps + 1):
+        for steps in range(SETTINGS.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
             if not np.isfinite(size):
                 return NewtonResult(z, size, steps, SolverStatus.NOT_FINITE, "the integration fails at the seed")
@@ -324,7 +318,7 @@ def newton(
                 return NewtonResult(z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps")
             polished = size <= tolerance * scale  # one more step costs little and gains digits
             stopped = reason_to_stop()
-            if stopped or steps == settings.steps:
+            if stopped or steps == SETTINGS.steps:
                 break
             try:
                 with casadi_silenced():
@@ -343,10 +337,10 @@ def newton(
                 status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED
                 return NewtonResult(z, size, steps, status, word)
             length = 1.0
-            for _ in range(settings.halvings):
+            for _ in range(SETTINGS.halvings):
                 trial = z + length * step
-                trial_value = evaluate(trial)
-                if np.linalg.norm(trial_value) < (1.0 - settings.descent * length) * np.linalg.norm(value) or polished:
+                trial_value = residual_at(trial)
+                if np.linalg.norm(trial_value) < (1.0 - SETTINGS.descent * length) * np.linalg.norm(value) or polished:
                     break
                 length *= 0.5
             else:
@@ -357,4 +351,4 @@ def newton(
             z, value = trial, trial_value
     if stopped is not None:
         return NewtonResult(z, size, steps, stopped, str(stopped))
-    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {settings.steps} Newton steps")
+    return NewtonResult(z, size, steps, SolverStatus.ITERATION_LIMIT, f"not converged in {SETTINGS.steps} Newton steps")

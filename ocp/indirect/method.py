@@ -33,7 +33,7 @@ from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.problem import Problem
 from ocp.problem.values import evaluate_at_samples
 from ocp.solution import ByName, Guess, Solution
-from ocp.solution_data import check_variables_match
+from ocp.solution_data import check_variables_match, match_order
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 
@@ -201,6 +201,7 @@ class PreparedIndirect:
             if missing:
                 words = f"the guess, plan {seed.name!r}, has no costates of {', '.join(missing)}"
                 raise ProblemError(words, name=missing[0])
+            seed = match_order(form, seed)
         else:
             direct = self.method.seed
             if self.hamiltonian.linear:  # bang-bang controls oscillate between free collocation points

@@ -1,7 +1,8 @@
 """Initial guess of the indirect method from a direct solution (seed): bang-bang arcs, unknowns and data.
 
 The signs of dH/du along the seed determine at which bound each linear control is, and where it switches. A seed with a
-singular arc or chattering is rejected. States, costates and switch times of the seed are the first unknowns.
+singular arc or chattering is rejected. States, costates and switch times of the seed are the first unknowns. The seed
+has its variables in the order of the problem (:func:`ocp.solution_data.match_order`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import evaluate_at_samples
 from ocp.solution import Solution
+from ocp.solution_data import stack
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
 
@@ -81,10 +83,7 @@ def read_arcs(
     index_of = list(ham.linear)
     index = form.bounds.places["control"][index_of]
     low, high = bounds[0][index], bounds[1][index]
-    x, lam, u = (
-        np.hstack([np.zeros((len(seed.t), 0)), *[pool[name] for name in places]])
-        for pool, places in ((seed.states, form.states), (seed.costates, form.states), (seed.controls, form.controls))
-    )
+    x, lam, u = (stack(pool) for pool in (seed.states, seed.costates, seed.controls))
     guess = np.hstack([u[:, list(ham.smooth)], np.zeros((len(u), len(form.path)))])
     slope = evaluate_at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
     seed_low, seed_high = seed_bounds(form, seed, bounds)
@@ -143,10 +142,7 @@ def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.n
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
-    sizes = [values.shape[1] for values in seed.controls.values()]
-    columns = dict(zip(seed.controls, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
-    order = np.concatenate([columns[name] for name in ham.form.controls])[list(ham.linear)]  # in the order of the seed
-    values = samples.values.reshape(len(at), -1)[:, order]
+    values = samples.values.reshape(len(at), -1)[:, list(ham.linear)]
     for j, index in enumerate(ham.linear):
         margin = SETTINGS.inside * (high[j] - low[j])
         inside = (values[:, j] > low[j] + margin) & (values[:, j] < high[j] - margin)
@@ -194,7 +190,7 @@ def read_unknowns(
     horizon = seed.horizon if form.horizon_is_free else float(form.horizon_at(p))
     times = arcs.times(horizon)
     fractions = times / horizon
-    x, lam, _ = sample_seed(form, seed, fractions)
+    x, lam, _ = sample_seed(seed, fractions)
     places = form.bounds.places
     ends = []
     for end in ("initial", "terminal"):
@@ -209,13 +205,10 @@ def read_unknowns(
     return np.concatenate([np.hstack([x, lam]).ravel(), arcs.switches * horizon, free, multipliers]), data
 
 
-def sample_seed(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_seed(seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states, costates and controls of a direct solution at K fractions of its horizon. Shape (K, size) each."""
-    sample = seed.at_fraction(fractions)
-    reported = np.hstack([seed.costates[name] for name in form.states])
-    lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in reported.T])
-    controls = [np.zeros((len(fractions), 0)), *[sample[name] for name in form.controls]]
-    return np.hstack([sample[name] for name in form.states]), lam, np.hstack(controls)
+    lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in stack(seed.costates).T])
+    return seed.state_interpolant(fractions), lam, seed.control_interpolant(fractions)
 
 
 def control_guess(
@@ -226,7 +219,7 @@ def control_guess(
     With bounds, the control equations cannot be solved from distant multipliers: all controls would be at bounds.
     """
     form, count = ham.form, len(fractions)
-    x, lam, control = sample_seed(form, seed, fractions)
+    x, lam, control = sample_seed(seed, fractions)
     mu = np.zeros((count, len(form.path)))
     if len(form.path):
         low, high = (bound[form.bounds.places["control"]] for bound in bounds)

@@ -30,6 +30,7 @@ from ocp.problem.hulls import WORLD, CoveredPairs, Separation
 from ocp.problem.intervals import (
     RULES,
     Interval,
+    bounded_where,
     check_instructions,
     constant,
     decided_masks,
@@ -96,11 +97,6 @@ class _Jet(NamedTuple):
 ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
 
 
-def _slope_where(valid: Any, slope: Interval) -> Interval:
-    """Return the given slope bounds in intervals that a mask marks as valid, and infinite bounds in the others."""
-    return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
-
-
 def _smooth(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a smooth operation, by the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
@@ -113,7 +109,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
     for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
         if jet.slope.low.any() or jet.slope.high.any():
             slope = ADD(slope, MULTIPLY(partial, jet.slope))
-    return _Jet(value, _slope_where(np.isfinite(value.low) & np.isfinite(value.high), slope))
+    return _Jet(value, bounded_where(np.isfinite(value.low) & np.isfinite(value.high), slope))
 
 
 @lru_cache(maxsize=4096)
@@ -131,7 +127,7 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 def _piecewise_constant(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a piecewise constant operation: floor, ceil, sign, comparisons."""
     value = RULES[code](*(jet.value for jet in jets))
-    return _Jet(value, _slope_where(value.low == value.high, constant(0.0, value.low)))
+    return _Jet(value, bounded_where(value.low == value.high, constant(0.0, value.low)))
 
 
 def _absolute(code: int, x: _Jet) -> _Jet:
@@ -144,39 +140,35 @@ def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
     """Return bounds of the value and slope of fmin or fmax, from both operands where either may be the extreme one."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
-    ends = [
-        np.where(first, slope_x, np.where(second, slope_y, hull(slope_x, slope_y)))
-        for slope_x, slope_y, hull in zip(
-            (x.slope.low, x.slope.high), (y.slope.low, y.slope.high), (np.minimum, np.maximum), strict=True
-        )
-    ]
-    return _Jet(RULES[code](x.value, y.value), Interval(ends[0], ends[1]))
+    either = np.minimum(x.slope.low, y.slope.low), np.maximum(x.slope.high, y.slope.high)
+    slope = bounded_where(first, x.slope, *bounded_where(second, y.slope, *either)[:2])
+    return _Jet(RULES[code](x.value, y.value), slope)
 
 
 def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:
     holds, fails = decided_masks(test.value)
-    slope = Interval(np.where(holds, x.slope.low, 0.0), np.where(holds, x.slope.high, 0.0))
-    return _Jet(RULES[code](test.value, x.value), _slope_where(holds | fails, slope))
+    slope = bounded_where(holds | fails, bounded_where(holds, x.slope, 0.0, 0.0))
+    return _Jet(RULES[code](test.value, x.value), slope)
 
 
 def _modulo(code: int, x: _Jet, y: _Jet) -> _Jet:
     multiple, known = multiple_of(x.value, y.value, np.trunc if code == ca.OP_FMOD else np.rint)
     slope = SUBTRACT(x.slope, MULTIPLY(Interval(multiple, multiple), y.slope))
-    return _Jet(RULES[code](x.value, y.value), _slope_where(known, slope))
+    return _Jet(RULES[code](x.value, y.value), bounded_where(known, slope))
 
 
 def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
     size = _absolute(ca.OP_FABS, x).slope
     down = y.value.high < 0
     slope = Interval(np.where(down, -size.high, size.low), np.where(down, -size.low, size.high))
-    return _Jet(RULES[code](x.value, y.value), _slope_where(down | (y.value.low > 0), slope))
+    return _Jet(RULES[code](x.value, y.value), bounded_where(down | (y.value.low > 0), slope))
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
     """Return bounds of the value and slope of atan2, which jumps by a full turn on the negative x axis."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
-    return _Jet(smooth.value, _slope_where(continuous, smooth.slope))
+    return _Jet(smooth.value, bounded_where(continuous, smooth.slope))
 
 
 _KINKED: dict[int, Callable[..., _Jet]] = {

@@ -111,7 +111,7 @@ class ExpressionReader:
             raise ProblemError(f"{what} is empty")
         if bounds[0] is None and bounds[1] is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
-        tolerances = read_tolerance(what, tolerance, vector.numel())
+        tolerances = read_positive(f"{what}: tolerance", tolerance, vector.numel())
         if any(self._changes_in_time(what, bound) for bound in bounds):
             sides = [
                 self.expression(f"{what}: bound", bound, (self.time, *self.parameters))
@@ -122,7 +122,7 @@ class ExpressionReader:
             zeros = np.zeros(vector.numel())
             if len(sides) == 2 and not equal:
                 bounds = np.append(zeros, np.full(len(zeros), -np.inf)), np.append(zeros + np.inf, zeros)
-                tolerances = None if tolerances is None else 2 * tolerances
+                tolerances = None if tolerances is None else np.tile(tolerances, 2)
             else:
                 bounds = (zeros if bounds[0] is not None else None, zeros if bounds[1] is not None else None)
                 sides = sides[:1]
@@ -199,15 +199,19 @@ def _columns(array: np.ndarray) -> int:
     return int(array.shape[1] if array.ndim == 2 and min(array.shape) > 1 else array.size)
 
 
-def read_scale(what: str, value: Value, size: int) -> Any:
-    """Return the scale of each entry of a variable, nan where unknown; None if no scale is given. Shape (size,)."""
+def read_positive(what: str, value: Value, size: int, *, scale: bool = False) -> np.ndarray | None:
+    """Return a positive number for each of ``size`` entries, given one for all or each; None for None. Shape (size,).
+
+    Those of a ``scale`` are finite, or nan where the scale is unknown.
+    """
     if value is None:
         return None
-    array = numeric(f"{what}: scale", value)
-    if array.size not in (1, size) or not (np.isnan(array) | (np.isfinite(array) & (array > 0))).all():
-        words = f"{what}: scale must be positive, one number or {size}, nan for an unknown one, not {value!r}"
-        raise ProblemError(words, value=value, limit=size)
-    return np.array(np.broadcast_to(array.ravel(), size))
+    array = numeric(what, value)
+    valid = np.isnan(array) | ((array > 0) & np.isfinite(array)) if scale else array > 0
+    if array.size not in (1, size) or not valid.all():
+        rule = f"positive, one number or {size}" + (", nan for an unknown one" if scale else "")
+        raise ProblemError(f"{what} must be {rule}, not {value!r}", value=value, limit=size)
+    return np.array(np.broadcast_to(array, size))
 
 
 def check_guess(what: str, guess: Any, size: int) -> None:
@@ -219,17 +223,6 @@ def check_guess(what: str, guess: Any, size: int) -> None:
     if array.size not in (1, size) and not (array.ndim == 2 and array.shape[1] == size and len(array) > 1):
         words = f"{what}: guess has {array.size} entries, {size} expected"
         raise ProblemError(words, value=array.size, limit=size)
-
-
-def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
-    """Return a tolerance for each entry of a constraint; None if no tolerance is given. Shape (size,)."""
-    if value is None:
-        return None
-    array = numeric(f"{what}: tolerance", value)
-    if array.size not in (1, size) or not (array > 0).all():
-        words = f"{what}: tolerance must be positive numbers, 1 or {size} of them, not {value!r}"
-        raise ProblemError(words, value=value, limit=size)
-    return [float(entry) for entry in np.broadcast_to(array, size)]
 
 
 def signal_function(what: str, track: Callable[[Any], Any]) -> Any:

@@ -16,7 +16,16 @@ import numpy as np
 from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import Constraint, Declarations, Signal, Variable
 from ocp.problem.problem import Problem, checked_problem
-from ocp.problem.values import Sampler, check_finite, check_horizon, check_inside, check_order, constant, numeric
+from ocp.problem.values import (
+    Sampler,
+    check_finite,
+    check_horizon,
+    check_inside,
+    check_order,
+    constant,
+    dependence,
+    numeric,
+)
 
 Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a bound table, (n,) each
 
@@ -396,16 +405,14 @@ class Formulation:
         lower = ca.vertcat(symbols(0, 1), *[c.lower for c in pool.values()])
         upper = ca.vertcat(symbols(0, 1), *[c.upper for c in pool.values()])
         equality = np.array([bool(ca.is_equal(lower[i], upper[i], 8)) for i in range(len(names))], dtype=bool)
-        controls = np.asarray(ca.DM(ca.jacobian_sparsity(expression, self.u), 1).full()) != 0
-        states = np.asarray(ca.DM(ca.jacobian_sparsity(expression, self.x), 1).full()) != 0
         return Rows(
             expression,
             names,
             tuple(c.name for c in pool.values() for _ in range(c.size)),
             self.bounds.places[kind],
             equality,
-            controls.reshape(len(names), self.nu).any(axis=1),
-            states.reshape(len(names), self.nx),
+            np.asarray(dependence(expression, self.u).any(axis=1)),
+            dependence(expression, self.x),
             np.array(
                 [t for c in pool.values() for t in ([np.inf] * c.size if c.tolerance is None else c.tolerance)],
                 dtype=float,

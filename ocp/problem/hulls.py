@@ -24,9 +24,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from models.checks import set_fields
 from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.errors import ProblemError, require
-from ocp.problem.values import check_finite, table
+from ocp.problem.values import table
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,20 +52,13 @@ class Hull:
     link: str = ""
 
     def __post_init__(self) -> None:
-        core, normal = table("hull: core", self.core), table("hull: normal", self.normal)
-        if core.ndim != 2 or core.shape[0] < 1 or core.shape[1] != 3:
-            raise ProblemError(f"hull: core has shape {core.shape}, expected (m, 3)", name="core", value=core.shape)
-        check_finite("hull: core", core)
-        if not (np.isfinite(self.radius) and self.radius >= 0):
-            words = f"hull: radius {self.radius!r} m is not finite and >= 0"
-            raise ProblemError(words, name="radius", value=self.radius)
-        if normal.size and (normal.shape != (3,) or not abs(np.linalg.norm(normal) - 1) < 1e-9):
-            words = f"hull: normal {normal.tolist()} is not a unit vector of three entries"
+        core = require.array("hull: core", self.core, ("m", 3))
+        normal = require.array("hull: normal", self.normal, (3,)) if np.size(self.normal) else np.zeros(0)
+        radius = require.nonnegative("hull: radius", self.radius, unit="m")
+        if normal.size and not abs(np.linalg.norm(normal) - 1) < 1e-9:
+            words = f"hull: normal {normal.tolist()} is not a unit vector"
             raise ProblemError(words, name="normal", value=normal.tolist())
-        object.__setattr__(self, "frame", int(self.frame))
-        object.__setattr__(self, "radius", float(self.radius))
-        object.__setattr__(self, "core", core)
-        object.__setattr__(self, "normal", normal)
+        set_fields(self, frame=int(self.frame), core=core, radius=radius, normal=normal)
 
     @cached_property
     def middle(self) -> np.ndarray:
@@ -398,15 +392,18 @@ class Separation:
 
     def __post_init__(self) -> None:
         what = f"separation {require.text('separation: its name', self.name)!r}"
-        pairs = index_rows(what, "pairs", self.pairs, 3)
-        object.__setattr__(self, "pairs", pairs)
-        object.__setattr__(self, "covers", _checked_covers(what, self.covers, len(pairs)))
-        for text in (part for item in require.mapping(f"{what}: assumed", self.assumed).items() for part in item):
-            require.text(f"{what}: assumed", text)
+        pairs, assumed = index_rows(what, "pairs", self.pairs, 3), require.mapping(f"{what}: assumed", self.assumed)
+        for reason in assumed.values():
+            require.text(f"{what}: assumed", reason)
+        set_fields(self, pairs=pairs, covers=_checked_covers(what, self.covers, len(pairs)), assumed=assumed)
         self._check_bodies(what)
         n, k = len(pairs), sum(self.movers.values())
-        for label, shape in {"least": (n,), "levers": (n, k), "turns": (n, k)}.items():
-            object.__setattr__(self, label, _bounds(what, label, getattr(self, label), shape))
+        least = require.broadcast(f"{what}: least", self.least, n, "pairs")
+        bounds = {
+            label: require.array(f"{what}: {label}", getattr(self, label), (n, k), sign="nonnegative")
+            for label in ("levers", "turns")
+        }
+        set_fields(self, least=least, **bounds)
 
     def _check_bodies(self, what: str) -> None:
         """Raise ProblemError unless all pairs refer to existing bodies on existing frames."""
@@ -462,19 +459,6 @@ def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]
             raise ProblemError(words, name="covers", value=pair, limit=count)
         covering[int(pair)] = index_rows(what, "covers", rows, 2)
     return {pair: rows for pair, rows in covering.items() if len(rows)}
-
-
-def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Convert minimum distances or motion bounds to an array of a given shape; raise ProblemError if invalid."""
-    array = table(f"{what}: {label}", value)
-    array = np.broadcast_to(array, shape) if array.ndim == 0 else array.reshape(shape) if not shape[0] else array
-    if array.shape != shape:
-        words = f"{what}: {label} has shape {array.shape}, expected {shape}"
-        raise ProblemError(words, name=label, value=array.shape, limit=shape)
-    check_finite(f"{what}: {label}", array)
-    if label != "least" and (array < 0).any():
-        raise ProblemError(f"{what}: {label} is negative", name=label, value=float(array.min()), limit=0.0)
-    return np.array(array)
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:

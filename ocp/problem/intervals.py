@@ -43,9 +43,13 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
         inputs: The range of each input, over the same M intervals.
     """
-    return interpret(
-        function, inputs, lambda value: constant(value, inputs[0].low), lambda code, *operands: RULES[code](*operands)
-    )
+    with np.errstate(all="ignore"):
+        return interpret(
+            function,
+            inputs,
+            lambda value: constant(value, inputs[0].low),
+            lambda code, *operands: RULES[code](*operands),
+        )
 
 
 def interpret(
@@ -104,14 +108,9 @@ def _range_of(corners: list[Array]) -> Interval:
     return _widen(stacked.min(axis=0), stacked.max(axis=0))
 
 
-def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
-    """Decorate an interval rule so that it emits no floating-point warnings."""
-
-    def without_warnings(*operands: Interval) -> Interval:
-        with np.errstate(all="ignore"):
-            return rule(*operands)
-
-    return without_warnings
+def bounded_where(known: Any, x: Interval, low: Any = -np.inf, high: Any = np.inf) -> Interval:
+    """Return an interval where a mask says that it is known, elsewhere `low` to `high`, by default unbounded."""
+    return Interval(np.where(known, x.low, low), np.where(known, x.high, high))
 
 
 def _add(x: Interval, y: Interval) -> Interval:
@@ -126,9 +125,8 @@ def _add(x: Interval, y: Interval) -> Interval:
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
     """Return the range of if_else: `yes` where the test always holds, `no` where it always fails, else both."""
     holds, fails = decided_masks(test)
-    low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
-    high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
-    return Interval(low, high)
+    either = np.minimum(yes.low, no.low), np.maximum(yes.high, no.high)
+    return bounded_where(holds, yes, *bounded_where(fails, no, *either)[:2])
 
 
 def decided_masks(test: Interval) -> tuple[Any, Any]:
@@ -174,8 +172,7 @@ def _power(x: Interval, y: Interval) -> Interval:
         return _widen(x.low**exponent, x.high**exponent)
     base = _clamp(x, low=0.0)
     powers = _range_of([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
-    unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # y may contain an integer exponent
-    return Interval(np.where(unknown, -np.inf, powers.low), np.where(unknown, np.inf, powers.high))
+    return bounded_where((x.low >= 0) | ((x.high >= 0) & fixed), powers)  # y may contain an integer exponent
 
 
 def _clamp(x: Interval, low: float = -np.inf, high: float = np.inf) -> Interval:
@@ -193,9 +190,7 @@ def _increasing_rule(
 
     def rule(x: Interval) -> Interval:
         inside = _clamp(x, low, high)
-        result = _widen(function(inside.low), function(inside.high))
-        undefined = (x.high < low) | (x.low > high)
-        return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
+        return bounded_where((x.high >= low) & (x.low <= high), _widen(function(inside.low), function(inside.high)))
 
     return rule
 
@@ -219,24 +214,21 @@ def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[...
         result = _widen(np.minimum(*ends), np.maximum(*ends))
         high = np.where(_contains_multiple(x, crest, tau), 1.0, np.minimum(result.high, 1.0))
         low = np.where(_contains_multiple(x, crest + tau / 2, tau), -1.0, np.maximum(result.low, -1.0))
-        unbounded = ~(np.isfinite(x.low) & np.isfinite(x.high))
-        return Interval(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
+        return bounded_where(np.isfinite(x.low) & np.isfinite(x.high), Interval(low, high), -1.0, 1.0)
 
     return rule
 
 
 def _tangent(x: Interval) -> Interval:
-    pole = _contains_multiple(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
-    result = _widen(np.tan(x.low), np.tan(x.high))
-    return Interval(np.where(pole, -np.inf, result.low), np.where(pole, np.inf, result.high))
+    smooth = ~_contains_multiple(x, tau / 4, tau / 2) & np.isfinite(x.low) & np.isfinite(x.high)
+    return bounded_where(smooth, _widen(np.tan(x.low), np.tan(x.high)))
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
     """Return the range of atan2(y, x): from its values at the ends of both intervals, or a full turn at its jump."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
-    crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
-    return Interval(np.where(crosses_cut, -half, result.low), np.where(crosses_cut, half, result.high))
+    return bounded_where((x.low > 0) | (y.low > 0) | (y.high < 0), result, -half, half)
 
 
 def _hypot(x: Interval, y: Interval) -> Interval:
@@ -275,9 +267,7 @@ def _reduce(x: Interval, y: Interval, rounded: Callable[[Any], Any], low: Array,
     """Return the range of x - y * rounded(x / y), which is known to lie between `low` and `high`. Shape (M,) each."""
     multiple, known = multiple_of(x, y, rounded)
     result = _subtract(x, _multiply(Interval(multiple, multiple), y))
-    return Interval(
-        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
-    )
+    return bounded_where(known, Interval(np.maximum(result.low, low), np.minimum(result.high, high)), low, high)
 
 
 def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
@@ -357,6 +347,6 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "OR": lambda x, y: _not(_and(_not(x), _not(y)))._replace(negates=None),
     "IF_ELSE_ZERO": _if_else_zero,
 }
-RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}
+RULES = {getattr(ca, f"OP_{name}"): rule for name, rule in _BY_NAME.items()}
 """Interval rules of operations, by the instruction code of casadi."""
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 
 from ocp.problem.formulation import Bounds, Formulation, is_free
+from ocp.problem.values import dependence
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
 MAX_DEGREE = 3  # of the polynomials
@@ -91,7 +92,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
     """
     candidates = ~np.concatenate([is_free(state.terminal) for state in form.problem.declared.states.values()])
     candidates |= form.end.uses_state.any(axis=0)
-    pattern = np.asarray(ca.DM(ca.jacobian_sparsity(form.f, ca.vertcat(form.x, form.u)), 1).full()) != 0
+    pattern = dependence(form.f, ca.vertcat(form.x, form.u))
     while candidates.any():
         driving = np.append(~candidates, np.ones(form.nu, bool))
         alone = pattern[candidates][:, driving & (pattern[candidates].sum(axis=0) == 1)].any(axis=1)

@@ -26,10 +26,11 @@ import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError, error_names, require
-from ocp.problem.declarations import Constraint, PhaseTimes, Variable
+from ocp.problem.declarations import ENDS, Constraint, PhaseTimes, Variable
 from ocp.problem.hulls import Separation
 from ocp.problem.problem import Problem, checked_problem
-from ocp.problem.values import constant, identity, is_symbolic, numeric
+from ocp.problem.values import constant, identity, middle_horizon
+from ocp.solution_data import entry_named
 
 DURATION = "duration"
 """Name of the state that represents the free duration of a phase."""
@@ -58,10 +59,7 @@ class Phase:
         return self._symbol(state)
 
     def _symbol(self, name: str) -> Any:
-        own = self._whole.of(self.name)
-        if name not in own:
-            raise require.unknown(f"state or control of phase {self.name!r}", name, own)
-        return own[name].symbol
+        return entry_named(f"state or control of phase {self.name!r}", name, self._whole.of(self.name)).symbol
 
 
 class Phases(Problem):
@@ -83,10 +81,11 @@ class Phases(Problem):
     """
 
     def __init__(self, name: str, phases: Mapping[str, Problem]) -> None:
-        if not _by_name("phases", phases):
+        phases = require.mapping("phases", phases)
+        if not phases:
             raise ProblemError(f"problem {name!r}: phases must not be empty", name="phases")
         for phase, problem in phases.items():
-            if not require.text(f"problem {name!r}: name of a phase", phase) or "." in phase:
+            if not phase or "." in phase:
                 words = f"problem {name!r}: a phase needs a name without a dot, not {phase!r}"
                 raise ProblemError(words, name="phases", value=phase)
             if checked_problem(problem).declared.phases:
@@ -105,9 +104,7 @@ class Phases(Problem):
 
     def __getitem__(self, name: str) -> Phase:
         """Return a phase by its name."""
-        if not isinstance(name, str) or name not in self.declared.phases:
-            raise require.unknown("phase", name, self.declared.phases)
-        times = self.declared.phases[name]
+        times = entry_named("phase", name, self.declared.phases)
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
@@ -128,7 +125,7 @@ class Phases(Problem):
             ProblemError: An unknown phase or state, an expression of the wrong size, a second join, nothing to join.
         """
         first, second = self[before], self[after]
-        values = dict(_by_name("states", {} if states is None else states))
+        values = require.mapping("states", states)
         begins = {name: v for name, v in parts_of_phase(after, self.declared.states).items() if name != DURATION}
         ends = parts_of_phase(before, self.declared.states)
         for name in values:
@@ -165,19 +162,11 @@ class Phases(Problem):
         Raises:
             ProblemError: ``running`` is not zero: it belongs to the problem of a phase.
         """
-        with error_names("running"):
-            is_zero = not is_symbolic(running) and not numeric("running cost", running).any()
-        if not is_zero:
+        density, cost = self._costs(running, terminal)
+        if not density.is_zero():
             words = f"problem {self.name!r}: a running cost belongs to the problem of a phase"
             raise ProblemError(words, name="running", value=running)
-        own = self.declared.running, self.declared.terminal
-        self.declared.running = self.declared.terminal = None
-        try:
-            super().minimize(0, terminal)
-        except ProblemError:
-            self.declared.running, self.declared.terminal = own
-            raise
-        self.declared.running, self.declared.terminal = own[0], own[1] + self.declared.terminal
+        self.declared.terminal = self.declared.terminal + cost
 
 
 class _PhaseInserter:
@@ -273,17 +262,16 @@ class _PhaseInserter:
         self.guess_duration = horizon.guess
         if self.guess_duration is None:  # the default of any problem
             low, high = (float(constant(bound)[0]) for bound in bounds.values())
-            within = np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high)
-            self.guess_duration = None if np.isnan(within) else float(within)
+            within = middle_horizon(low, high)
+            self.guess_duration = None if np.isnan(within) else within
         name = self._prefix(DURATION)
         duration = self.whole.free_parameter(name, 1, **bounds, guess=self.guess_duration, unit="s")
         self._replace(horizon.symbol, duration)
         return duration, None
 
     def _variable(self, kind: str, variable: Variable) -> Any:
-        values = {"lower": self._column(variable.lower), "upper": self._column(variable.upper)}
-        if kind == "state":
-            values |= {"initial": self._column(variable.initial), "terminal": self._column(variable.terminal)}
+        parts = ("lower", "upper", *(ENDS if kind == "state" else ()))
+        values = {part: self._column(getattr(variable, part)) for part in parts}
         guess = variable.guess
         if callable(guess):
             guess = None if self.guess_duration is None else _of_fraction(guess, self.guess_duration)
@@ -318,12 +306,6 @@ def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
     """Return those states, controls or other entries that belong to a phase, by their names within the phase."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
-
-
-def _by_name(what: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ProblemError(f"{what}: a mapping by name is expected, not {value!r}", name=what, value=value)
-    return value
 
 
 def _of_fraction(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:

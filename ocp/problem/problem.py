@@ -25,7 +25,7 @@ from ocp.problem.declarations import (
     Variable,
 )
 from ocp.problem.enclosures import PrescribedMotion
-from ocp.problem.expressions import ExpressionReader, check_guess, number_of_entries, read_scale, signal_function
+from ocp.problem.expressions import ExpressionReader, check_guess, number_of_entries, read_positive, signal_function
 from ocp.problem.hulls import Hull, Separation, index_rows, stack_motion_bounds
 from ocp.problem.record_reader import from_record
 from ocp.problem.record_writer import to_record
@@ -397,27 +397,30 @@ class Problem:
         parameters = self._reader.parameters
         known = [*(state.symbol for state in states.values()), *parameters, self.time]
         frames = self._reader.expression(f"{what}: placements", placements, known)
-        parts |= {"covers": {} if covers is None else covers, "assumed": {} if assumed is None else assumed}
+        parts |= {"covers": covers, "assumed": assumed}
         separation = Separation(name, frames, dict(hulls), pairs, least, movers, **parts)
         zeros = [ca.DM.zeros(parameter.shape) for parameter in parameters]
-        PrescribedMotion(
-            separation, frames, self.time, parameters=parameters, values=zeros
-        )  # raises if a motion has no bounds
+        # raises if a motion has no bounds
+        PrescribedMotion(separation, frames, self.time, parameters=parameters, values=zeros)
         self.declared.apart[name] = separation
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
         """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
         if self.declared.running is not None:
             raise ProblemError(f"problem {self.name!r}: the cost is declared twice")
+        self.declared.running, self.declared.terminal = self._costs(running, terminal)
+
+    def _costs(self, running: Value, terminal: Value) -> list[Any]:
+        """Return the running and the terminal cost as scalar expressions; raise ProblemError if they are invalid."""
         ends = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
         ends += [*self.declared.at_start.values(), *self._times()]
-        costs = {}
+        costs = []
         for label, cost, known in (("running", running, self._inner()), ("terminal", terminal, ends)):
             with error_names(label):
-                costs[label] = self._reader.expression(f"{label} cost", cost, known)
-                if (size := costs[label].numel()) != 1:
+                costs.append(self._reader.expression(f"{label} cost", cost, known))
+                if (size := costs[-1].numel()) != 1:
                     raise ProblemError(f"{label} cost must be a scalar, it has {size} entries", value=size, limit=1)
-        self.declared.running, self.declared.terminal = costs["running"], costs["terminal"]
+        return costs
 
     def check(self) -> None:
         """Raise ProblemError if the declaration is incomplete: no state, a state without dynamics, no horizon."""
@@ -434,8 +437,7 @@ class Problem:
         return f"Problem {self.name!r}\n{self.declared}"
 
     def __repr__(self) -> str:
-        d = self.declared
-        return f"<Problem {self.name!r}: {len(d.states)} states, {len(d.controls)} controls>"
+        return f"<Problem {self.name!r}: {len(self.declared.states)} states, {len(self.declared.controls)} controls>"
 
     def _variable(
         self, kind: str, name: str, size: int | None, values: dict[str, Value], guess: Guess, unit: str, scale: Value
@@ -446,7 +448,8 @@ class Problem:
         symbol = self._symbol(kind, name, size)
         low, high = self._reader.bounds(what, size, values["lower"], values["upper"])
         check_guess(what, guess, size)
-        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=read_scale(what, scale, size))
+        scales = read_positive(f"{what}: scale", scale, size, scale=True)
+        return Variable(name, symbol, low, high, guess=guess, unit=unit, scale=scales)
 
     @property
     def _reader(self) -> ExpressionReader:

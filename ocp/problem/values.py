@@ -98,6 +98,17 @@ def check_horizon(what: str, value: np.ndarray) -> None:
         raise ProblemError(words, value=float(value[0]))
 
 
+def middle_horizon(low: float, high: float) -> float:
+    """Return the horizon at which a solve starts without a guess, s: the middle of its bounds, or a value near 1 s."""
+    return float(np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high))
+
+
+def dependence(expression: Any, symbols: Any) -> np.ndarray:
+    """Return which entries of a column of expressions contain which of a column of symbols. Shape (m, n), bool."""
+    pattern = np.asarray(ca.DM(ca.jacobian_sparsity(expression, symbols), 1).full()) != 0
+    return np.asarray(pattern.reshape(expression.numel(), symbols.numel()))
+
+
 BLOCK_SIZES = (512, 32, 8, 1)  # samples per call: one map of all samples takes longer to build than to evaluate
 
 

@@ -16,7 +16,7 @@ from models import FixedBase, planar_chain
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, Solution, SolveError, solve, tighten
 from ocp.direct.prepared import Prepared
 from ocp.problem.formulation import Formulation
-from ocp.solution_data import match_order, tightening_at
+from ocp.solution_data import NODE_TOLERANCE, match_order
 from tests.ocp.problems import double_integrator, plant, van_der_pol
 
 pytestmark = pytest.mark.xdist_group("tightening")  # one process, so that every plan is tightened once
@@ -49,6 +49,17 @@ def beyond(solution: Solution) -> float:
 @cache
 def tightened(method: Any) -> Solution:
     return tighten(walled(), method)
+
+
+def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return the amounts by which the bounds of a plan were tightened at M horizon fractions. Shape (2, M, m).
+
+    ``bound_tightening`` (2, N, m) holds them for each interval; at a node between two intervals the larger one counts.
+    """
+    last = len(mesh) - 2
+    sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-NODE_TOLERANCE, NODE_TOLERANCE))
+    left, right = (bound_tightening[:, side] for side in sides)
+    return np.asarray(np.maximum(left, right))
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)

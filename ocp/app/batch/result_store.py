@@ -381,7 +381,7 @@ def finite(text: str) -> float:
 
 
 def file_at(place: Path, number: int) -> Path:
-    """Return the path of the file of a result's plan or solution, from the path of its record and a number from 0."""
+    """Return the path of a stored plan or solution from the path of its record and the number, from 0, of the file."""
     return place.with_suffix(f".{number}.npz")
 
 

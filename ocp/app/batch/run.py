@@ -142,7 +142,7 @@ def run_batch(
 
 
 def texts_of(tasks: Any) -> dict[str, str]:
-    """Return the canonical text of each distinct task by its key; raise ProblemError for what is no list of data."""
+    """Return the canonical text of each distinct task by its key; raise ProblemError if `tasks` is no list of data."""
     if isinstance(tasks, str | bytes | dict):
         raise ProblemError(f"tasks must be a list of tasks, not one: {tasks!r}", name="tasks", value=tasks)
     texts: dict[str, str] = {}

@@ -231,10 +231,10 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below 1 s in which sample times give plausible joint speeds, "" if there is none, and a speed.
+    """Return the unit below 1 s in which sample times are plausible, or "", and the highest joint speed for times in s.
 
-    It is that of the fastest joint, relative to its limit (or 1), in seconds. Plausible are samples at 10 kHz or less,
-    and a fastest joint at 1 to 1000 % of its limit.
+    The speed is relative to the joint's limit, or to 1 without one. Times are plausible if the samples are at 10 kHz or
+    less, and the fastest joint moves at 1 to 1000 % of its limit.
     """
     h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
     used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())
@@ -243,7 +243,7 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 
 def _convert_to_seconds(samples: _Samples) -> None:
-    """Convert times that are whole numbers far apart from milliseconds, or a smaller unit, and add a fault."""
+    """Convert times to s, and add a fault, if they are whole numbers so far apart that their unit must be smaller."""
     t = samples.t
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return
@@ -305,7 +305,7 @@ def _worst_in_degrees(samples: _Samples, turning: list[int], margin: Array) -> i
 
 
 def _unwrap(samples: _Samples) -> list[Fault]:
-    """Remove jumps of the positions by full turns; return a fault for each joint with limits that had such a jump.
+    """Remove jumps of the positions by full turns; return a fault for each such joint that has position limits.
 
     For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.

@@ -47,7 +47,7 @@ class RowVerdict(StrEnum):
 
     @classmethod
     def of(cls, failed: Any, doubtful: Any = False) -> RowVerdict:
-        """Return the verdict on a value that has a limit: FAILED if it is certainly beyond, UNDECIDED if it may be."""
+        """Return the verdict on a limited value: FAILED if the limit is certainly violated, UNDECIDED if possibly."""
         return cls.FAILED if failed else cls.UNDECIDED if doubtful else cls.OK
 
 
@@ -199,7 +199,7 @@ class Motion:
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
-        """Return the same samples with another rule; raise ProblemError if it needs values that they do not have."""
+        """Return the same samples with another rule of interpolation; raise ProblemError if it needs missing values."""
         missing = "velocities" if self.v is None else "accelerations" if self.a is None and rule == "quintic" else None
         if rule != "linear" and missing:
             words = f"the rule {rule!r} needs {missing}, which are not given for every joint; omit the rule"
@@ -277,9 +277,9 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least maxima of a quantity and its negative in each interval, of all motions through the samples.
+        """Return the least possible maximum of a quantity, and of its negative, in each interval between samples.
 
-        Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
+        Acceleration: a motion through two samples needs the least acceleration if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
         times the mean of both velocities. Given accelerations count as well. Jerk: three weighted means, with weights 1
         and the Chebyshev polynomials U1 and U2 of the interval; from rest to rest this gives 32 of the 60 that a
@@ -456,11 +456,11 @@ def _side(quantity: MotionQuantity, column: int, sign: float, limit: float, tole
 def _check_limits(
     quantity: MotionQuantity, column: int, order: str, name: str, unit: str, low: float, high: float, share: float
 ) -> tuple[Row, list[Fault]]:
-    """Check a quantity of one joint against its limits; return the table row, and a list with a fault or without."""
+    """Check a quantity of one joint against its limits; return the table row and a list of at most one fault."""
     note = "" if quantity.closed else "of any motion through the samples, by divided differences"
     t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
-    tolerance = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
-    sides = [_side(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
+    tolerance = share * max((abs(limit) for limit in (low, high) if np.isfinite(limit)), default=0.0)
+    sides = [_side(quantity, column, *side, tolerance) for side in ((1.0, high), (-1.0, -low))]
     if not np.isfinite([low, high]).any():
         worst = max(sides, key=lambda side: float(side.values.max()))
         return Row(f"{order} of {name}", worst.worst_value, None, unit, worst.time, RowVerdict.UNLIMITED, note), []

@@ -49,12 +49,12 @@ INSIDE = np.linspace(0.0, 1.0, 5)
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Samples of a quantity, and the limit of its size, or its least value.
+    """Samples of a quantity, and the largest permitted magnitude or the least permitted value.
 
     Attributes:
         name, unit, note: Name and unit of the quantity, and method of the check.
         times, values: Times, s, and values. Shape (K,).
-        limit: Largest size, infinite if there is none; the least value if `least` is set.
+        limit: Largest magnitude, infinite if unlimited; the least value if `least` is set.
         share: Tolerance relative to the limit.
         blur: Error of the samples: a violation by less is undetermined.
     """
@@ -72,13 +72,13 @@ class Quantity:
 
 @dataclass(eq=False)
 class Findings:
-    """Rows of the table of a check, and faults, to which each check adds its own."""
+    """Table rows and faults that the checks of a trajectory find; each check appends its own."""
 
     rows: list[Row] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
 
     def judge(self, each: Quantity, fault: tuple[str, str], text: str, details: Mapping[str, Array] = {}) -> None:
-        """Compare samples of a quantity with its limit.
+        """Compare samples of a quantity with its limit; append a table row and, if the limit is violated, a fault.
 
         `fault` is the kind and name of the fault. `text` describes it with the fields value, time, first (time), limit
         and unit, and those of `details`, which has further samples (K,).
@@ -183,7 +183,7 @@ def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
         v = (slope[:-1] * right + slope[1:] * left) / (left + right)
         return t[1:-1], motion.q[1:-1], v, 2 * np.diff(slope, axis=0) / (left + right)
     interval, fraction = np.repeat(np.arange(len(h)), len(INSIDE)), np.tile(INSIDE, len(h))
-    q, v, a = (one.within(interval, fraction) for one in (motion.position, motion.velocity, motion.acceleration))
+    q, v, a = (curve.within(interval, fraction) for curve in (motion.position, motion.velocity, motion.acceleration))
     needed = np.broadcast_to(motion.needed("acceleration")[0], (len(h), a.shape[1]))[interval]
     return t[interval] + fraction * h[interval], q, v, np.clip(a, -needed, needed)
 
@@ -217,7 +217,7 @@ def check_ground(findings: Findings, machine: Standing, motion: Motion, friction
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Return the configurations (M, base_size) of a floating base at the samples of a joint motion, and table rows.
+    """Integrate the motion of a floating base; return its configurations (M, base_size) at the samples, and table rows.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.
@@ -234,7 +234,7 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
         next_base = ca.vertcat(next_base[:3], next_base[3:] / ca.norm_2(next_base[3:]))
     count = len(motion.t) - 1
     interval, fraction = np.repeat(np.arange(count), 3), np.tile([0.0, 0.5, 1.0], count)
-    stacked = [one.within(interval, fraction).T for one in (motion.position, motion.velocity)]
+    stacked = [curve.within(interval, fraction).T for curve in (motion.position, motion.velocity)]
     step = ca.Function("step", [base, q, v, h], [next_base], {"cse": True})
     steps = step.mapaccum(count)(machine.base_home(), *stacked, np.diff(motion.t)[None])
     bases = np.vstack([machine.base_home(), np.array(steps).T])
@@ -377,7 +377,7 @@ def check_clearance(findings: Findings, scene: CollisionScene, motion: Motion, b
 
 
 def _verdict(pair: ClosestPair) -> RowVerdict:
-    """Return whether two bodies keep their required distance, up to the tolerance."""
+    """Return the verdict on the distance between two bodies, which may be below the required one by a tolerance."""
     failed = pair.distance < pair.required - CLEARANCE_TOLERANCE_M
     return RowVerdict.of(failed, pair.missed > CLEARANCE_TOLERANCE_M)
 
@@ -461,7 +461,7 @@ def check_path(
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the z axes (K, 3) that waypoints require of the tool at points, given as fractional numbers (K,)."""
+    """Return the required z axes (K, 3) of the tool at waypoint numbers (K,), interpolated at fractional numbers."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

@@ -122,8 +122,8 @@ class Check:
         if self.unlimited:
             lines.append("unlimited: " + "; ".join(self.unlimited))
         lines += map(str, self.suspicions)
-        lines += [f"not checked: {one}" for one in self.unchecked]
-        lines += [f"note: {one}" for one in self.notes]
+        lines += [f"not checked: {quantity}" for quantity in self.unchecked]
+        lines += [f"note: {note}" for note in self.notes]
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:

@@ -114,10 +114,10 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """Read joint states or trajectories from a log; return their topic, and time stamp (ns) and fields of each message.
+    """Read joint states or trajectories from an MCAP log; return the topic, and stamp (ns) and fields of each message.
 
-    A stamp is that of the message's header, or the log time if that is zero. Without a topic, it is the only one of
-    these kinds, or `/joint_states`.
+    A stamp is that of the message's header, or the log time if the header's is zero. By default, the topic is the only
+    one with messages of these types or, if there are several, `/joint_states`.
 
     Raises:
         ProblemError: The file is missing or no valid log, the topic is unknown, or mcap-ros2-support is not installed.
@@ -164,7 +164,7 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of an MCAP log in file order, also inside chunks; raise ValueError if a record, or the log, is
+    """Yield the records of an MCAP log, also those in chunks, in file order; raise ValueError if a record or the log is
     too large.
     """
     from mcap.exceptions import EndOfFile
@@ -263,7 +263,7 @@ SIGNAL STRUC SWITCH THEN TO TRIGGER UNTIL WAIT WHEN WHILE WITH""".split()  # noq
 
 
 class RobotLanguage(NamedTuple):
-    """Grammar of the programs for the controllers of one maker, as far as selfmotion writes them.
+    """Syntax of the robot programs of one manufacturer, as far as selfmotion writes it.
 
     Attributes:
         title, comment: Name of the language, and sign that begins a comment.

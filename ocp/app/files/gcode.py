@@ -263,7 +263,7 @@ class _Reader:
         self._note("G4: P is read as seconds")
 
     def _to_machine_position(self, code: int, words: dict[str, float]) -> None:
-        """Move to a position in the machine's own coordinates; if it is unknown, ignore the move and add a note."""
+        """Move to the machine's home position (G28, G30, G53); if it is unknown, ignore the move and add a note."""
         if code in (281, 301):
             self._refuse(f"{code_name(code)} stores a position of the machine; {REPOST}")
         axes = [i for i, axis in enumerate(AXES) if axis in words]
@@ -290,7 +290,7 @@ class _Reader:
         self._rapid(target)
 
     def _shift(self, codes: set[int], words: dict[str, float]) -> None:
-        """Set the offset so that the current position gets the given coordinates (G92), or reset the offset."""
+        """Shift the origin so that the current position gets the given coordinates (G92), or remove the shift."""
         if 920 not in codes:
             self.offset = np.zeros(3)
             return

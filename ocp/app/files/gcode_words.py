@@ -30,9 +30,7 @@ RADIUS_SHARE = 1e-3
 
 
 class ArcError(Exception):
-    """Error that the numbers of a G-code line do not describe an arc: reason, remaining gap, largest gap that is
-    closed, m.
-    """
+    """Error raised if the numbers of a G-code line describe no arc; states the reason, the gap and its limit, m."""
 
     def __init__(self, why: str, size: float, limit: float) -> None:
         super().__init__(why)
@@ -56,7 +54,7 @@ def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bo
 def arcs_about_center(
     start: Array, end: Array, center: Array, *, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
-    """Return the arc or helix about a centre from start to end, or two halves of it if no centre fits both ends.
+    """Return the arc or helix about a centre from start to end, or two arcs if no single centre fits both ends.
 
     Two are needed if a circle nearly closes but ends nearer to the centre (2,) than it starts. `turns` is the number of
     begun turns, `plane` has the indices of the first axis, the second axis and the normal, and `gap` is the largest
@@ -222,7 +220,7 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
 
 
 class _InvalidBlock(Exception):
-    """Error that a line is not G-code."""
+    """Error raised if a line is not valid G-code."""
 
 
 def _without_comments(text: str) -> str:
@@ -237,7 +235,7 @@ def _without_comments(text: str) -> str:
 
 
 def _block(number: int, text: str, words: Sequence[str]) -> Block | None:
-    """Return the words of a line, in upper case and without comments, as a block; None if none of them counts."""
+    """Return the words of a line, in upper case and without comments, as a block; None without codes and values."""
     if exponent := EXPONENT.search(" ".join(words)):
         raise _InvalidBlock(f"{exponent[0]!r} is not a G-code number; write it without E")
     line = CHECKSUM.sub("", DELETED.sub("", "".join(words)))

@@ -230,7 +230,7 @@ class Program:
 
 
 def checked_reversal(owner: str, value: Any) -> Reversal:
-    """Return the treatment of path reversals after a check: "split", or the width (m) of a bulb-shaped turn."""
+    """Check and return the treatment of path reversals: "split", or the width (m) of a bulb-shaped turn."""
     if isinstance(value, str):
         require.choice(f"{owner}: reversal", value, ("split",))
         return "split"

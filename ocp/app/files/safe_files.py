@@ -1,4 +1,4 @@
-"""Read text files, tables and trees from untrusted sources safely, and check where outputs may be written.
+"""Read text files, tables, JSON and YAML from untrusted sources safely, and check where outputs may be written.
 
 JSON and YAML are read as trees of bounded size and depth. An alias of YAML counts with all the values that it stands
 for, so that a walk through the tree ends in bounded time. An output lies below its folder, has the suffix of its kind
@@ -316,7 +316,7 @@ SIGNATURES = {
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
-    """Return the path to which an output is written, with links resolved.
+    """Check whether an output may be written to a file; return the path of the file with links resolved.
 
     `kind` is a key of SUFFIXES. The output must be in or below `folder`, unless that is None. Only if `force` is set, a
     file may be overwritten that selfmotion did not write.

@@ -1,4 +1,4 @@
-"""Read settings: TOML files, by name and expected type, with errors that name the line; obstacles; limits of MoveIt.
+"""Read the entries of TOML files by name and type, with errors that name the line; obstacles; MoveIt's joint limits.
 
 A file of obstacles has the shapes in world, each under [[obstacle]], as docs/guide/command.md shows them.
 `joint_limits.yaml` is the file in which MoveIt keeps the limits that a URDF cannot state.
@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,10 @@ from warnings import warn
 import casadi as ca
 import numpy as np
 
-from models import Box, Capsule, Cylinder, HalfSpace, Mesh, ModelError, ModelWarning, MovingObstacle, Robot, Sphere
+from models import Mesh, ModelError, ModelWarning, MovingObstacle, Robot
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
-from models.shapes.shapes import Shape
+from models.shapes.shapes import SHAPE_KINDS, Shape
 from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines, read_tree
 from ocp.errors import ProblemError, require
@@ -165,19 +166,19 @@ class TomlTable:
         return {key: float(value) for key, value in table._values.items()}
 
     def values(self, readers: Readers) -> dict[str, Any]:
-        """Return the entries that are not missing, by name, each read by the function of its name."""
+        """Return those entries named in `readers` that the table has, by name, each read by its function."""
         values = {name: read(self, name, *arguments) for name, (read, *arguments) in readers.items()}
         return {name: value for name, value in values.items() if value is not None}
 
-    def build(self, kind: Callable[..., T], readers: Readers, **others: Any) -> T:
-        """Return `kind(**values)` of all entries of the table and other arguments; errors of `kind` name the line."""
-        values = self.values(readers) | others
+    def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
+        """Call `kind` with the entries of the table and other arguments; errors that `kind` raises name the line."""
+        values = self.values(readers) | arguments
         self.done()
         with located_errors(self):
             return kind(**values)
 
     def nested(self, name: str, kind: Callable[..., T], readers: Readers) -> T | None:
-        """Return what `build` makes of the nested table `name`; None if it is missing."""
+        """Return the result of `build` for the nested table `name`; None if the table is missing."""
         table = self.table(name, f"a table of {', '.join(readers)}")
         return None if table is None else table.build(kind, readers)
 
@@ -231,7 +232,7 @@ class TomlTable:
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Raise ProblemError if the table has entries of other names than the given ones."""
+        """Raise ProblemError if the table has entries with other names than the given ones."""
         self._read_names.extend(names)
         self.done()
 
@@ -374,26 +375,25 @@ def rotation_of(entries: TomlTable, _: str = "", entry: str = "rpy") -> Array:
 
 
 POSITION, SIZE = ((TomlTable.vector, 3, f"three {things}", REQUIRED) for things in ("numbers, m", "lengths, m"))
-LENGTH, TURN = (TomlTable.positive, "m", REQUIRED), (rotation_of, "rpy")
-NORMAL = (TomlTable.vector, 3, "three numbers: out of what is solid", REQUIRED)
-SHAPES: dict[str, tuple[type, Readers]] = {
-    "box": (Box, {"size": SIZE, "position": POSITION, "rotation": TURN}),
-    "sphere": (Sphere, {"radius": LENGTH, "position": POSITION}),
-    "capsule": (Capsule, {"radius": LENGTH, "start": POSITION, "end": POSITION}),
-    "cylinder": (Cylinder, {"radius": LENGTH, "length": LENGTH, "position": POSITION, "rotation": TURN}),
-    "halfspace": (HalfSpace, {"normal": NORMAL, "point": POSITION}),
-    "mesh": (Mesh, {"position": POSITION[:3], "rotation": TURN, "scale": (TomlTable.positive, "m for each unit")}),
+SHAPE_ENTRIES: Readers = {  # by the name of a field, the same for all shapes that have this field
+    **dict.fromkeys(("position", "start", "end", "point"), POSITION),
+    **dict.fromkeys(("radius", "length"), (TomlTable.positive, "m", REQUIRED)),
+    "size": SIZE,
+    "normal": (TomlTable.vector, 3, "three numbers: out of what is solid", REQUIRED),
+    "rotation": (rotation_of, "rpy"),
+    "scale": (TomlTable.positive, "m for each unit"),
 }
-"""Kinds of shapes, with their entries."""
+SHAPES = {kind.__name__.lower(): kind for kind in SHAPE_KINDS}
 
 
 def read_shape(table: TomlTable, folder: Path = Path(), kinds: Iterable[str] = SHAPES) -> Any:
-    """Return the shape that a whole table describes; names of mesh files are relative to `folder`."""
-    kind, readers = SHAPES[table.choice("shape", kinds, REQUIRED)]
-    others = (
-        {"file": folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)} if kind is Mesh else {}
-    )
-    return table.build(kind, readers, **others)
+    """Return the shape that a table describes; names of mesh files are relative to `folder`."""
+    kind = SHAPES[table.choice("shape", kinds, REQUIRED)]
+    readers = {each.name: SHAPE_ENTRIES[each.name] for each in fields(kind) if each.name in SHAPE_ENTRIES}
+    if kind is not Mesh:
+        return table.build(kind, readers)
+    file = folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
+    return table.build(kind, readers | {"position": POSITION[:3]}, file=file)
 
 
 def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:
@@ -453,7 +453,7 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
 
 
 def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array:
-    """Return the limits (dof,) of independent joints, of one kind: those of a file, else of the robot description."""
+    """Return the limits (dof,) of one kind for the independent joints, from a file or else the robot description."""
     vector = np.full(robot.dof, np.inf)
     for name, (column, multiplier, _) in robot.couplings.items():
         joint = robot.joint(name)
@@ -464,7 +464,7 @@ def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array
 
 
 def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> float | None:
-    """Return a limit of a joint in joint_limits.yaml, infinite for no limit, or None if its entry gives none."""
+    """Return a limit of a joint: inf if joint_limits.yaml switches it off, None if the file does not state it."""
     has, value = entry.get(f"has_{kind}_limits"), entry.get(f"max_{kind}")
     if has is not None and not isinstance(has, bool):
         raise _invalid(file, joint, f"has_{kind}_limits must be true or false", has, limit=(True, False))
@@ -479,7 +479,7 @@ def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> f
 
 
 def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
-    """Return the default scaling factor of velocities or accelerations that joint_limits.yaml states, else 1."""
+    """Return the default scaling factor of velocities or accelerations from joint_limits.yaml, by default 1."""
     key = f"default_{kind}_scaling_factor"
     if not 0 < real(tree.get(key, 1.0)) <= 1:
         raise _invalid(file, key, "must be a number above 0, at most 1", tree[key], limit=(0.0, 1.0))

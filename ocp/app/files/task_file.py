@@ -57,7 +57,7 @@ def _velocity(entries: TomlTable, name: str) -> Any:
 
 
 def _orientation(entries: TomlTable, name: str) -> Any:
-    """Read a quaternion, or in its place the rotation matrix of the entry `rpy`."""
+    """Read an orientation: a quaternion, or else the rotation matrix from the entry `rpy`."""
     if "rpy" not in entries:
         return entries.vector(name, 4, "four numbers: a quaternion w, x, y, z")
     if name in entries:
@@ -193,7 +193,7 @@ SPRING: Readers = dict.fromkeys(("stiffness", "rest"), (TomlTable.vector, 3, "th
 
 
 def _located(entries: TomlTable, name: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function; its errors name the line of an entry."""
+    """Call a function and return its result; its errors name the line of an entry."""
     with located_errors(entries, name):
         return function(*arguments)
 
@@ -261,7 +261,7 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
 
 
 def _machine(entries: TomlTable, folder: Path, base: str = "fixed") -> Machine:
-    """Read the table [robot], or that of a captured body, and return the robot on its base, whose default is given."""
+    """Read the table of a robot or of a captured body; return the machine, whose type of base is `base` by default."""
     urdf = folder / entries.text("urdf", "the name of a URDF file", REQUIRED)
     if not urdf.is_file():
         raise entries.error("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
@@ -298,7 +298,7 @@ def _loaded(entries: TomlTable, robot: Robot) -> Robot:
 
 
 def _tasks(root: TomlTable, folder: Path, machine: Machine) -> Any:
-    """Read the motions of a task file, and return what the planner takes as its tasks."""
+    """Read the motions of a task file and return the tasks for the planner."""
     named = [kind for kind in (*MOTIONS, "task") if kind in root]
     if len(named) != 1:
         why = "has no motion" if not named else f"has {' and '.join(named)}, which are different motions"
@@ -316,7 +316,7 @@ def _tasks(root: TomlTable, folder: Path, machine: Machine) -> Any:
 
 
 def _motion(root: TomlTable, kind: str, folder: Path, machine: Machine) -> Any:
-    """Read the table of one motion, or the list of paths at the same time, and return what the planner takes."""
+    """Read the table of one motion, or a list of simultaneous paths, and return the tasks for the planner."""
     if kind == "path" and isinstance(root.raw("path"), list):
         return [_task(entries, folder, machine) for entries in root.tables("path")]
     return MOTIONS[kind](root.required_table(kind, f"a table [{kind}]"), folder, machine)
@@ -381,10 +381,10 @@ def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
 
 def _goal(entries: TomlTable, folder: Path, machine: Machine) -> Goal:
     """Read the table [goal] of a task file and return the goal."""
-    others: dict[str, Any] = {"tasks": _motion(entries, "path", folder, machine)} if "path" in entries else {}
+    arguments: dict[str, Any] = {"tasks": _motion(entries, "path", folder, machine)} if "path" in entries else {}
     if "load" in entries:
-        others["machine"] = replace(machine, robot=_loaded(entries, machine.robot))  # type: ignore[type-var]
-    return entries.build(Goal, GOAL, **others)
+        arguments["machine"] = replace(machine, robot=_loaded(entries, machine.robot))  # type: ignore[type-var]
+    return entries.build(Goal, GOAL, **arguments)
 
 
 def _waypoints(entries: TomlTable, folder: Path, machine: Machine) -> Waypoints:

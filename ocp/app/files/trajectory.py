@@ -63,7 +63,7 @@ class RawTrajectory:
     """Joint trajectory as it is written in a file, faults included.
 
     Attributes:
-        names: Names of the joints. The columns of a table may be something else, which the table does not say.
+        names: Names of the joints; some may be columns of other quantities whose names a table does not explain.
         t: Times as written, s. Shape (M,).
         positions, velocities, accelerations, efforts: Shape (M, n), rad or m, per s, per s^2, N m or N. nan if a value
             is missing, None if all are.
@@ -104,7 +104,7 @@ def read_trajectory(
         columns: Names of the columns of a table without a header.
         period: Sampling period, s, of a table without times, or of a KRL program, which has none.
         topic: Topic of an MCAP with several.
-        joints: Names that are joints even if they look like something else.
+        joints: Names of columns that are joints even if the names look like other quantities.
         kind: "csv", "json", "yaml", "mcap", "urscript", "krl" or "rapid"; None: by the suffix of the name.
 
     Raises:
@@ -343,7 +343,7 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
 
 
 def _read_program(file: FileName, language: RobotLanguage, period: float | None) -> RawTrajectory:
-    """Read a robot program that `write_robot_program` wrote; spaces, empty lines and other comments are free."""
+    """Read a robot program that `write_robot_program` wrote; spaces, empty lines and added comments are ignored."""
     patterns = [re.compile(statement, re.ASCII) for statement in language.statements]
     joints: dict[str, tuple[str, float]] = {}
     rows, steps, lines, stage = list[list[float]](), list[float](), list[int](), 0
@@ -418,7 +418,7 @@ def _axis_positions(language: RobotLanguage, text: str, joints: dict[str, tuple[
 
 
 def _program_number(text: str) -> float:
-    """Return a decimal number of a robot program; raise ValueError if it is none or has too many digits."""
+    """Convert the text of a decimal number to a float; raise ValueError if the text is invalid or too long."""
     if len(text) > INPUT_LIMITS.number_characters or not PROGRAM_NUMBER.fullmatch(text):
         raise ValueError(
             f"{text[:80]!r} is not a decimal number of at most {INPUT_LIMITS.number_characters} characters"

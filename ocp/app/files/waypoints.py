@@ -223,7 +223,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 def _orientations(
     file: FileName, parts: Mapping[Any, Array], rows: Sequence[TableRow]
 ) -> tuple[Array | None, Array | None]:
-    """Return the orientations of waypoints as quaternions, and their axes if only these are given; None without."""
+    """Return the quaternions of waypoints and, if the file gives only tool axes, the axes; each None if unknown."""
     axes = _axes(file, parts[AXIS], rows) if AXIS in parts else None
     if QUATERNION in parts:
         return align_signs(_quaternions(file, parts[QUATERNION], rows)), None

@@ -1,4 +1,4 @@
-"""Sample a motion for display; the motion is a plan, the solution of any problem, or any joint trajectory.
+"""Sample plans, solutions of optimal control problems, and joint trajectories for display.
 
 Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as known.
 """
@@ -68,7 +68,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Corners (k, 2), m, of the contact area, and zero moment points (M, 2), m, with or without external forces."""
+    """Corners (k, 2) of the contact area, and zero moment points (M, 2), m; `forces` if these count external forces."""
 
     corners: Array
     points: Array
@@ -309,7 +309,7 @@ def animate_solution(
     details |= _audit_verdict([solution], lambda: solution.audit(**settings))
     times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
     details["closest"] = _closest_pairs([(solution, "", times_of_pairs)], solution.horizon)
-    smooth = _torque_like(solution, joints)
+    smooth = _is_smooth(solution, joints)
     own_curves = _problem_curves(solution, fractions, times)
     samples = MotionSamples(times, q, v, a if smooth else None, base_path, base_rates)
     return _animation(name, machine, samples, own_curves, **details)
@@ -348,8 +348,9 @@ def _animation(
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
-    costs = [one for one in own_curves if one.group == "Cost"]
-    curves += [one for one in costs if abs(one.values[-1] - effort[-1]) > relative * max(abs(effort[-1]), 1e-12)]
+    costs = [curve for curve in own_curves if curve.group == "Cost"]
+    least = relative * max(abs(effort[-1]), 1e-12)
+    curves += [cost for cost in costs if abs(cost.values[-1] - effort[-1]) > least]
     curves += machine_curves(machine, samples)
     closest = details.get("closest")
     if closest is not None:
@@ -357,7 +358,7 @@ def _animation(
         curves.append(Curve("The motion", "closest two bodies", "m", distances, float(closest.required.min())))
     footing = None
     if isinstance(machine, Standing) and samples.accelerations is not None:
-        inside = [one for one in own_curves if one.group == ZMP_CONSTRAINT]
+        inside = [curve for curve in own_curves if curve.group == ZMP_CONSTRAINT]
         footing, more = ground_contact(machine, samples, inside)
         curves += more
     curves += joint_curves(machine, Limits().bounds(machine), samples)
@@ -371,7 +372,7 @@ def _times(horizon: float) -> Array:
     return np.linspace(0.0, horizon, count + 1)
 
 
-def _torque_like(solution: Solution, joints: str) -> bool:
+def _is_smooth(solution: Solution, joints: str) -> bool:
     """Return whether the joint positions of a solution are smooth enough for inverse dynamics."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]

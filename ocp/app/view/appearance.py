@@ -90,7 +90,7 @@ class Appearance:
 def appearance_of(
     robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """Return the surfaces with which the links of a robot are displayed, modified or not: shapes move with their links.
+    """Return the surfaces with which the links of a robot are displayed, also if the robot was modified after reading.
 
     `folders` are searched first for `meshes`, which are read if that is set. If there are more than `most` faces,
     nearby corners are merged.
@@ -229,8 +229,8 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
     places = np.round(vertices, 6) + 0.0
     first, where = distinct_rows(places)
     places, faces = places[first], where[faces]
-    one, two, three = (places[faces[:, k]] for k in range(3))
-    areas = np.cross(two - one, three - one)
+    a, b, c = (places[faces[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a)
     length = np.linalg.norm(areas, axis=1)
     faces, areas, length = faces[length > 0], areas[length > 0], length[length > 0]
     units = areas / length[:, None]
@@ -376,7 +376,7 @@ def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]
                 elif hull.frame in moving_frames:
                     if placements is None:
                         placements = separation_frames(problem, solution, times, suffix)
-                    frames = next(frames for one, frames in placements if one is separation)
+                    frames = next(frames for known, frames in placements if known is separation)
                     poses = frames.rotations[:, hull.frame], frames.positions[:, hull.frame]
                     moving.setdefault(name, []).append((hull, *poses))
     obstacles = list(static.values())

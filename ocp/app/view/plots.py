@@ -69,7 +69,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of curves, see `limits_in_view`."""
+    """Draw the limits of the curves in a diagram as lines or, if they are distant, as text."""
     view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range=min_range)
     for limit in view.lines:
         ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
@@ -122,7 +122,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
         ProblemError: A motion cannot be compared, or has other joints.
     """
     names = plan.names
-    others = {name: _comparison(name, one, names) for name, one in _motions_by_name(against).items()}
+    others = {name: _comparison(name, motion, names) for name, motion in _motions_by_name(against).items()}
     motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
@@ -207,7 +207,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
-        curves = [_curves_over_time(one) for one in (solution, *others.values())]
+        curves = [_curves_over_time(motion) for motion in (solution, *others.values())]
         for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
             for number, curve in reversed([*enumerate(curves)]):
                 if name in curve:
@@ -255,9 +255,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s), in the interval of its phase, and values of each state and control by name, with both one-sided
-    values at nodes.
-    """
+    """Return times, s, and values of each state and control by name; jumps at nodes have the values of both sides."""
     if isinstance(motion, LocalSolution):
         return {name: (motion.t, values) for name, values in _local(motion).items()}
     nodes = motion.control_interpolant.breaks[1:-1]
@@ -286,9 +284,9 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
 def _motions_by_name(against: Any) -> dict[str, Any]:
     """Return the motions that are compared with a plan or solution, keyed by name."""
     if isinstance(against, Mapping):
-        named = {str(name): one for name, one in against.items()}
+        named = {str(name): motion for name, motion in against.items()}
     elif isinstance(against, list | tuple):
-        named = {f"other {number}": one for number, one in enumerate(against, 1)}
+        named = {f"other {number}": motion for number, motion in enumerate(against, 1)}
     else:
         return {} if against is None else {"the other": against}
     if not named:
@@ -298,7 +296,7 @@ def _motions_by_name(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new matplotlib figure, or a given figure after checking that it is empty, of a size in inches."""
+    """Return a new matplotlib figure of a size in inches, or resize a given figure, which must be empty."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)

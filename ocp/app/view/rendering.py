@@ -278,15 +278,15 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     """
     width, height = size
     depth, number = np.full(height * width, -np.inf), np.full(height * width, -1, dtype=np.intp)
-    one, two = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
-    area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+    ab, ac = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     top = np.clip(np.ceil(places[..., 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
     rows = np.clip(np.floor(places[..., 1].max(axis=1) - 0.5) + 1, 0, height).astype(np.int64) - top
     valid = np.flatnonzero((rows > 0) & (np.abs(area) > 1e-12) & (near < 1e8).all(axis=1))
-    one, two, start, rows = one[valid], two[valid], places[valid, 0], rows[valid]
+    ab, ac, start, rows = ab[valid], ac[valid], places[valid, 0], rows[valid]
     # gradients of the barycentric coordinates of the second and third corners
-    second = np.column_stack([two[:, 1], -two[:, 0]]) / area[valid, None]
-    third = np.column_stack([-one[:, 1], one[:, 0]]) / area[valid, None]
+    second = np.column_stack([ac[:, 1], -ac[:, 0]]) / area[valid, None]
+    third = np.column_stack([-ab[:, 1], ab[:, 0]]) / area[valid, None]
     fourth = -(second + third)[:, 0]
     slope = (near[valid, 1] - near[valid, 0])[:, None] * second + (near[valid, 2] - near[valid, 0])[:, None] * third
     for first_face, last_face in _batches(rows):
@@ -381,7 +381,7 @@ class _Sun:
 def _draw_floor(
     picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None, bare: NDArray[np.intp]
 ) -> None:
-    """Draw the floor, and the shadows on it, into the samples `bare` of an empty picture, which no surface covers."""
+    """Draw the floor and the shadows on it at those samples of a picture, `bare`, that no surface covers."""
     ray, eye = camera.rays(bare), camera.eye.astype(np.float32)
     depth = np.float32(floor.height - camera.eye[2]) / ray[:, 2]
     x, y = (eye[k] + depth * ray[:, k] for k in range(2))
@@ -419,9 +419,9 @@ def _shade(
     """
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     sides = b - a, c - a, camera.eye - a
-    one, two, to, origin = (each.astype(np.float32) for each in (*sides, a))
+    ab, ac, to, origin = (each.astype(np.float32) for each in (*sides, a))
     # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)
-    across, beside, flat_normals = np.cross(to, one), np.cross(two, to), np.cross(one, two)
+    across, beside, flat_normals = np.cross(to, ab), np.cross(ac, to), np.cross(ab, ac)
     normals, colors = mesh.normals.astype(np.float32), mesh.colors.astype(np.float32)
     to_light = (camera.axes[2] if sun is None else sun.to_sun).astype(np.float32)
     opacity = np.float32(alpha)
@@ -440,7 +440,7 @@ def _shade(
         incidence = normal @ to_light
         reaches: Any = 1.0
         if sun is not None:
-            place = origin[face] + u * one[face] + v * two[face]
+            place = origin[face] + u * ab[face] + v * ac[face]
             bias = np.float32(PICTURE_STYLE.shadow_bias * sun.step)
             reaches = sun.lit(place + bias * np.sign(incidence)[:, None] * normal)
         key = np.maximum(incidence, 0.0)

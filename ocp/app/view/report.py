@@ -200,12 +200,12 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
             ("The audit", tuple(audit_rows(audit))),
             (f"Samples every {period:g} s against the limits", check.limited_rows),
         ),
-        tuple(f"unlimited: {one}" for one in check.unlimited),
+        tuple(f"unlimited: {quantity}" for quantity in check.unlimited),
     )
 
 
 class LimitView(NamedTuple):
-    """Ends of the axis of a diagram, limits that are drawn as lines, and a text about distant ones at an edge."""
+    """Range of the vertical axis of a diagram, limits drawn as lines, and a text about limits outside of the range."""
 
     low: float
     high: float

@@ -151,7 +151,7 @@ def clearance_of(
     smooth: bool,
     pairs: Sequence[int] | None = None,
 ) -> Clearance:
-    """Prove the clearances of pairs of bodies, all if None, in a motion on a fixed base among fixed obstacles.
+    """Prove the clearances of pairs of bodies, by default all, in a motion on a fixed base among fixed obstacles.
 
     `joints` returns joint positions (M, n) at fractions of the horizon (M,), with the properties that
     `ocp.audit.clearance.Track` describes.
@@ -232,7 +232,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Return the expression that a function of SX symbols of base, joints and time gives, also for MX arguments."""
+    """Evaluate a function that accepts only SX expressions of base, joints and time, also for MX expressions."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

@@ -259,8 +259,8 @@ class TorqueLimits:
             words = f"at rest on the path, joint {name!r} needs {abs(rest[row, column]):.4g}, {limit:.4g} allowed"
             raise SolveError(words, name=name, value=float(rest[row, column]), limit=limit)
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(moving > 0, (allowed - rest) / moving, (allowed + rest) / -moving)
-        speed = float(np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, room).min()))))
+            ratio = np.where(moving > 0, (allowed - rest) / moving, (allowed + rest) / -moving)
+        speed = float(np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, ratio).min()))))
         holding, driving = rest * rates[:, self.limited], moving * rates[:, self.limited]  # the power at a speed s is
         power = SETTINGS.torque_share * self.power  # s holding + s^3 driving
 
@@ -313,7 +313,7 @@ def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array,
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest profiles (K,) of the fraction that straight motions cover of displacements (K, n)."""
+    """Return the fastest profiles (K,), from 0 to 1, of the covered fraction of straight displacements (K, n)."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -278,7 +278,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig at equally spaced times t, (samples,), rad, with the least integral of cost and rate.
+    """Return the roll of the rig at equally spaced times t, (samples,), rad, of least integrated cost and squared rate.
 
     Dynamic programming minimises the integral of `cost`, a function of (indices of times, rolls), both (n,), and of the
     weighted squared rate. A grid of rolls does not resolve accelerations. Their weight is replaced by a weight of the

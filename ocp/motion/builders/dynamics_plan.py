@@ -106,7 +106,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Return goals as a tuple; raise ProblemError unless one problem with a phase for each can reach them."""
+    """Return goals as a tuple; raise ProblemError if one has no duration or no joints, or if two have the same name."""
     checked = tuple(require.each("goals", goals, Goal))
     if not checked:
         raise ProblemError("goals: at least one is needed", name="goals", value=goals)
@@ -271,7 +271,7 @@ def _first_within_limits(
     begin: Guess,
 ) -> Solution:
     """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
-    of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a plan.
+    of least cost; raise SolveError if there is none, or if a plan fails only because of collisions.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin
@@ -346,13 +346,13 @@ def _tighten_limits(
         plan.cost + MESH_SETTINGS.cost_increase * abs(plan.cost),
     )
     try:
-        tight = tighten(problem, own, tolerance=MESH_SETTINGS.excess, options=settings, guess=plan, max_cost=largest)
+        result = tighten(problem, own, tolerance=MESH_SETTINGS.excess, options=settings, guess=plan, max_cost=largest)
     except SolveError as error:
         return error
-    if tight.cost <= largest:
-        return tight
-    words = f"limits tightened between the nodes raise the cost from {plan.cost:.6g} to {tight.cost:.6g}"
-    return SolveError(words, tight, name="cost", value=tight.cost, limit=largest)
+    if result.cost <= largest:
+        return result
+    words = f"limits tightened between the nodes raise the cost from {plan.cost:.6g} to {result.cost:.6g}"
+    return SolveError(words, result, name="cost", value=result.cost, limit=largest)
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:

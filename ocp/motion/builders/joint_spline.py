@@ -220,12 +220,12 @@ def _sample_places(path: Any, length: float, samples: int) -> Array:
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
-    """Return how far along a path the targets of a plan are at given times, from 0 to the path's length; raise
-    ProblemError unless the targets run along the whole path. Shape (M,).
+    """Return the distances, m, along a path of the targets of a plan at given times; raise ProblemError unless the
+    targets run along the whole path. Shape (M,).
     """
 
-    def fail(what: str, at: int, value: float) -> ProblemError:
-        words = f"the plan's tasks {what} at {times[at]:.6g} s, but must run along all of the path, without a pause; "
+    def fail(fault: str, at: int, value: float) -> ProblemError:
+        words = f"the plan's tasks {fault} at {times[at]:.6g} s, but must run along all of the path, without a pause; "
         words += "give (distances, joints) instead of the plan"
         limit = SPLINE.path_tolerance * length
         return ProblemError(words, name="plan", value=value, limit=limit, time=float(times[at]))
@@ -252,10 +252,10 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
             (np.where(np.isfinite(position), along.tangent, 0.0) ** 2).sum(axis=1), SPLINE.path_tolerance
         )
         distance = np.clip(distance + step, 0.0, length)
-    off = gaps(path.at(distance).position, position)
-    worst = int(off.argmax())
-    if not off[worst] <= SPLINE.path_tolerance * length:
-        raise fail(f"are {off[worst]:.3g} m off the path", worst, float(off[worst]))
+    errors = gaps(path.at(distance).position, position)
+    worst = int(errors.argmax())
+    if not errors[worst] <= SPLINE.path_tolerance * length:
+        raise fail(f"are {errors[worst]:.3g} m off the path", worst, float(errors[worst]))
     for end, expected in ((0, 0.0), (-1, length)):
         if abs(distance[end] - expected) > SPLINE.path_tolerance * length:
             raise fail(f"are {distance[end]:.6g} m from the beginning of the path", end, float(distance[end]))

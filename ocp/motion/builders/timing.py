@@ -295,8 +295,8 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the number of parts into which to split each mesh interval, from limit violation and integration error,
-    which decrease with the square of the length of the interval.
+    """Return the number of parts into which to split each mesh interval, from its limit violation and its integration
+    error; both decrease with the square of the interval's length.
     """
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
@@ -373,7 +373,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of a limited quantity but a torque to its limit at M samples. Shape (M,)."""
+    """Return the largest ratio of any limited quantity, except torques, to its limit at M samples. Shape (M,)."""
     usage = np.abs(limit_rows(path, limits, joints, motion.distance, torques=False).usage(motion))
     usage[:, 0] **= 2  # the speed at the centripetal limit, of which the acceleration is the square
     return np.asarray(np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1)))

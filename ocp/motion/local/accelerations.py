@@ -359,8 +359,8 @@ def resolve_accelerations(
 def _samples(
     motion: Any, law: Any, times: Array, states: Array, options: AccelerationOptions
 ) -> tuple[dict[str, Array], Stop | None]:
-    """Return samples of a motion by name up to the first one that fails, and why it fails: lift-off, too fast, or not
-    finite. A finite sample that fails is among them; "gap" is the norm of the pose errors of the tips.
+    """Return samples of a motion by name up to the first failure, and the reason: lift-off, too fast, or not finite.
+    They include a failed sample that is finite; "gap" is the norm of the tips' pose errors.
     """
     q, qd = np.split(states, 2, axis=1)
     qdd, gap = (np.array(part).T for part in law.map(len(times))(times[None, :], q.T, qd.T))

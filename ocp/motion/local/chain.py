@@ -102,7 +102,7 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the coefficients (1, 3) of 1, cos(q), sin(q) in fixed . (vector rotated about the axis by sign q)."""
+        """Return coefficients (1, 3) of 1, cos q, sin q in `fixed` . (`vector` rotated about the axis by `sign` q)."""
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
@@ -205,7 +205,7 @@ class Chain:
         return positions, rotations.reshape(-1, 3, 3)
 
     def random_configurations(self, count: int, seed: int) -> tuple[Array, Motion]:
-        """Return random joint positions (count, n), up to pi or the size of the arm, and the poses of the tip there."""
+        """Return random joint positions (count, n), within pi rad or the arm's size, and the tip poses there."""
         joints = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, len(self.axes)))
         joints[:, ~self.revolute] *= self.size / np.pi
         positions, rotations = self.poses(joints)
@@ -231,8 +231,8 @@ class Chain:
         error, jacobians = np.full(len(joints), np.inf), np.zeros((len(joints), 6, len(numbers)))
         active = np.arange(len(joints))
         for step in range(NEWTON.steps + 1):
-            missed, jacobian = self.linearize(joints[active], goal.take(pose[active]), free)
-            worst, previous = np.abs(missed).max(axis=1), error[active]
+            pose_errors, jacobian = self.linearize(joints[active], goal.take(pose[active]), free)
+            worst, previous = np.abs(pose_errors).max(axis=1), error[active]
             error[active], jacobians[active] = worst, jacobian
             # a solution at the limit of rounding no longer improves
             on = (worst > NEWTON.precision) & (worst < (NEWTON.rough if step == 0 else np.inf))
@@ -240,7 +240,7 @@ class Chain:
             on &= (worst < previous / NEWTON.progress) | (step < NEWTON.trial_steps)
             if step == NEWTON.steps or not on.any():
                 break
-            active, change = active[on], _damped_steps(jacobian[on], missed[on])
+            active, change = active[on], _damped_steps(jacobian[on], pose_errors[on])
             joints[active[:, None], numbers] += np.clip(change, -NEWTON.largest_step, NEWTON.largest_step)
         good = error <= NEWTON.exact
         return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
@@ -253,8 +253,8 @@ class Chain:
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the IK solutions of goal poses without duplicates, ordered by pose, with angles from -pi to pi; they
-        are distinguished by the joints with given indices.
+        """Return the IK solutions of goal poses, ordered by pose, with angles from -pi to pi and without duplicates,
+        which agree in the joints with given indices.
         """
         pose, joints, singular = solutions
         free = np.array(numbers, dtype=int)
@@ -269,15 +269,15 @@ class Chain:
         same = distance < NEWTON.same
         if (close := np.flatnonzero(~same & (distance < NEWTON.near))).size:
             middle = joints[first[close]] + difference[close] / 2
-            missed, _ = self.linearize(middle, goal.take(pose[first[close]]), numbers)
-            same[close] = np.abs(missed).max(axis=1) <= NEWTON.exact
+            pose_errors, _ = self.linearize(middle, goal.take(pose[first[close]]), numbers)
+            same[close] = np.abs(pose_errors).max(axis=1) <= NEWTON.exact
         kept = np.ones(len(pose), dtype=bool)
         kept[second[same]] = False
         return Solutions(pose[kept], joints[kept], singular[kept])
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
+    """Return index pairs of IK solutions of the same pose, from the increasing pose index of each. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return np.triu_indices(len(pose), 1)
     first = np.arange(len(pose))[:, None]
@@ -288,11 +288,11 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
     return first, second
 
 
-def _damped_steps(jacobian: Array, missed: Array) -> Array:
+def _damped_steps(jacobian: Array, pose_errors: Array) -> Array:
     """Return the joint steps (K, m) of Newton's method for pose errors (K, 6), damped at singularities."""
     transposed = jacobian.transpose(0, 2, 1)
     normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
-    return np.asarray(np.linalg.solve(normal, transposed @ missed[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(normal, transposed @ pose_errors[:, :, None])[:, :, 0])
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:

@@ -156,7 +156,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function of a tip pose that returns two IK solutions of a SCARA and how far the pose is out of reach."""
+        """Function from a tip pose to two IK solutions of a SCARA and the excess of the pose over its reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -167,7 +167,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a tip pose: candidate angles of the joints x and z of `_loop`, residuals and conditioning."""
+        """Function from a tip pose to candidate angles of joints x and z of `_loop`, residuals and conditioning."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -192,8 +192,8 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a tip pose and the two angles of `_pair_function` that returns two IK solutions of all joints,
-        the excess over the reach, and the lever arm of joint y, which is between x and z.
+        """Function from a tip pose and the two angles of `_pair_function` to two IK solutions of all joints, the excess
+        over the reach, and the lever arm of joint y, which is between x and z.
         """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
@@ -219,7 +219,7 @@ class _SymbolicLoop(NamedTuple):
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers of a chain, one for each choice of redundant, `lockable` joints that has one."""
+    """Return the closed-form solvers of a chain, one for each suitable choice of redundant joints from `lockable`."""
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
     n, forms = len(chain.order), list[ClosedForm]()
@@ -345,8 +345,8 @@ def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions for three joints that must produce a rotation, if their axes meet, or a planar motion, if
-    they are parallel, and the share by which this motion is out of their reach; the solutions are then the nearest.
+    """Return two solutions for three joints that must produce a rotation (meeting axes) or a planar motion (parallel
+    axes), and the fraction by which the motion exceeds their reach; the solutions are then the nearest.
     """
     a, b, c = axes
     goal_point = goal.point(c.point)

@@ -77,7 +77,7 @@ def distances_along(
 def near_pairs(
     scene: CollisionScene, joints: Array, reach: float, gradients: bool = True
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-    """Return the pairs of bodies, among fixed obstacles, that are closer than the clearance plus `reach`, m.
+    """Return the pairs of bodies in a scene of fixed obstacles that are closer than the clearance plus `reach`, m.
 
     Returns:
         Configuration, among (M, n) of a fixed base, and pair of each; its distance beyond the clearance, m, shape (K,);
@@ -147,7 +147,7 @@ def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return the cached evaluators of body frames, of (base, joints, time), and of pair distances of a scene."""
+    """Return a scene's cached functions: body frames from (base, joints, time), and pair distances from frames."""
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine

@@ -66,7 +66,7 @@ def axial(turn: Array) -> Array:
 
 
 class Axis(NamedTuple):
-    """Axis of a joint, unit direction and point on it: at each of M poses, (M, 3), or for all poses, (1, 3)."""
+    """Unit direction of a joint axis and a point on it, at each of M poses, (M, 3), or for all poses, (1, 3)."""
 
     direction: Array
     point: Array
@@ -105,7 +105,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate IK solutions that one choice of the joint at which the closed kinematic loop is opened yields."""
+    """Candidate IK solutions that result from opening the closed kinematic loop at one joint."""
 
     pose: NDArray[np.intp]  # index of the pose of each candidate, (K,)
     free: Array  # positions of the free joints, (K, 6)
@@ -116,7 +116,7 @@ class _Candidates(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Elimination(PoseSolver):
-    """Inverse kinematics of six joints by elimination. Use `elimination_of` to build it."""
+    """Solver of the inverse kinematics of six joints by elimination, built by `elimination_of`."""
 
     openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
@@ -213,8 +213,8 @@ def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Return singular vectors (M, 15, 15) and ranks (M,) of the terms of the first two joints of a loop, which are
-    eliminated, and coefficients (M or 1, 15, 3, 3, 3) of the terms of the other joints.
+    """Return singular vectors (M, 15, 15) and ranks (M,) of the terms of a loop's first two joints, to be eliminated,
+    and coefficients (M or 1, 15, 3, 3, 3) of the terms of the other joints.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -228,8 +228,8 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coefficients (M, 15, 3, ...) of the conformal coordinates of a line element in 1, cos h and sin h of
-    the joints that move it, the last one first; `axes` begins with the joint that moves the line element first.
+    """Return the coefficients (M, 15, 3, ...) of a moved line element's conformal coordinates in 1, cos h, sin h of
+    joint angles h. `axes` begins with the joint that moves it first; the trailing dimensions have the reverse order.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
@@ -261,7 +261,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the coefficients (M, 3, 12, 12) of 1, cos h and sin h, h the eigenvalue angle, in the problem."""
+    """Return the matrices (M, 3, 12, 12) that 1, cos h and sin h multiply in the eigenvalue problem of an angle h."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -275,8 +275,8 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices (M, 24, 24), the angles (M,) at eigenvalue 0, and reciprocal condition numbers (M,) of
-    polynomial eigenvalue problems, whose eigenvalues are tan((h - pole) / 2) of an angle h.
+    """Return companion matrices (M, 24, 24) of polynomial eigenvalue problems whose eigenvalues are tan((h - pole) / 2)
+    of an angle h, the poles (M,), rad, and reciprocal condition numbers (M,) of the leading coefficients.
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))
@@ -297,7 +297,7 @@ def _companions(matrices: Array) -> tuple[Array, Array, Array]:
 
 
 def _inverses(matrices: Array) -> Array:
-    """Return the inverses of matrices; those of exactly singular matrices are infinite."""
+    """Return the inverses of matrices; the inverse of an exactly singular matrix is infinite."""
     try:
         return np.asarray(np.linalg.inv(matrices))
     except np.linalg.LinAlgError:

@@ -120,7 +120,7 @@ def joint_range(machine: Machine, limits: bool) -> tuple[Array, Array]:
 
 
 def sampling_range(lower: Array, upper: Array, revolute: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return finite limits (n,) within which joints are sampled: a turn, or the slide range on either side, if free."""
+    """Return finite limits (n,) for sampling joints; an unlimited range becomes one turn or twice `ARM.slide_range`."""
     span = np.where(revolute, np.pi, ARM.slide_range)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     return low, np.where(np.isfinite(upper), upper, low + 2 * span)
@@ -214,7 +214,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class ArmSolver:
-    """Solver of all inverse kinematics solutions of an arm within its limits and of partly free orientations."""
+    """Solver of an arm's inverse kinematics within limits, on all branches and for partly free orientations."""
 
     chain: Chain
     solvers: tuple[PoseSolver, ...]  # for several choices of the sampled joints, the best-conditioned one first
@@ -293,7 +293,7 @@ class ArmSolver:
         return joints, pose, tuple(reasons)
 
     def _of_the_arm(self, solver: PoseSolver, solutions: Solutions, goal: Motion) -> Solutions:
-        """Return the solutions of a solver in the joints of the arm, without those that differ in added joints only."""
+        """Return a solver's solutions in the joints of the arm, one of each set that differs in added joints only."""
         n, extended = len(self.chain.axes), solver.chain
         if self.auxiliary:
             still = (np.abs(solutions.joints[:, list(self.auxiliary)]) < ARM.auxiliary).all(axis=1)
@@ -347,7 +347,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
-    """Return the solvers of an arm, if any, and its auxiliary joints; the orientation about `axes` (k, 3) is open."""
+    """Return the solvers of an arm, if any, and its auxiliary joints; orientation is free about `axes` (k, 3)."""
     extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
@@ -374,7 +374,7 @@ def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tu
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return the geometric mean of the least singular value of the Jacobian for each choice of redundant joints."""
+    """Return the Jacobian's least singular value, a mean over samples, for each choice of redundant joints."""
     _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
     columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
     values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
@@ -408,7 +408,7 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return configurations at task targets (size,) and samples of the free parameters; unlimited angles up to pi.
+        """Return configurations at task targets (size,) for samples of free parameters, unlimited angles within pi.
 
         Args:
             count: Number of samples of the free parameters, over several choices of the sampled joints.

@@ -83,7 +83,7 @@ class IkSolution:
 
 
 class Unreachable(ProblemError):
-    """Error that no joint positions were found for a pose.
+    """Error raised if inverse kinematics finds no joint positions for a pose.
 
     Attributes:
         joints: The nearest miss. Shape (joint_size,).
@@ -242,7 +242,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, if a solver lists these, and how many random guesses to add."""
+        """Return IK solutions (K, n) on all branches, if a solver exists, and the number of guesses to add."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -409,7 +409,7 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return an error that inverse kinematics found no solution; `misses` are the distance, m, and angle, rad, left."""
+    """Return the error that the targets are not reached; `misses` are the position (m) and angle (rad) errors."""
     names = [part.name for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]

@@ -211,7 +211,7 @@ class _Model:
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
     def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator over any one interval between samples; its parameters are start time and duration, s."""
+        """Return an integrator over one interval between samples; its parameters are start time and duration, s."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)
@@ -323,7 +323,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return motions straight in joint space from the starts of these motions to configurations (K, joint_size)."""
+        """Return straight motions in joint space from the starts of these motions to (K, joint_size) configurations."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)

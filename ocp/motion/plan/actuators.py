@@ -28,9 +28,8 @@ from ocp.motion.result.plan import CHECKED_TIMES
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
-from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.goals import Cost
-from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.limits import Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE
@@ -55,10 +54,7 @@ def without_actuators(limits: Limits) -> Limits:
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
     """Integrate the cost of a plan's motion by the trapezoidal rule; joints that are held at rest do not count."""
-    machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
-    sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
-    free = [name not in plan.held for name in plan.names]
-    bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
+    machine, t, samples = _moving_joints(plan)
     base, *motion = (ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 4))
     torques: Any = None
     if weights_torques(cost):
@@ -67,10 +63,21 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
     if cost.energy:
         running += cost.energy * ca.sum1(ca.fmax(torques * motion[1], 0.0))
     running_at = ca.Function("cost", [base, *motion], [running])
-    joints, rates, accelerations = (values[:, free] for values in sample[1:4])
-    jerks = np.gradient(accelerations, sample.t, axis=0)
-    values = running_at.map(CHECKED_TIMES)(bases.T, joints.T, rates.T, accelerations.T, jerks.T)
-    return float(np.trapezoid(np.array(values)[0], sample.t) + cost.time * plan.horizon)
+    jerks = np.gradient(samples[-1], t, axis=0)
+    values = running_at.map(CHECKED_TIMES)(*(part.T for part in (*samples, jerks)))
+    return float(np.trapezoid(np.array(values)[0], t) + cost.time * plan.horizon)
+
+
+def _moving_joints(plan: SolvedPlan) -> tuple[Any, Array, tuple[Array, ...]]:
+    """Return the machine of a plan with the held joints locked, sample times (M,), s, and samples of the motion.
+
+    The samples are base, joints, rates and accelerations. Shape (M, n) each.
+    """
+    machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
+    free = [name not in plan.held for name in plan.names]
+    base = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
+    return machine, sample.t, (base, *(values[:, free] for values in sample[1:4]))
 
 
 def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
@@ -79,30 +86,26 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.
     """
-    machine = checked_motors("limits", plan.machine)
-    robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
-    own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
-    bounds = JointBounds(*(all_joints(robot, unlimited, values) for values in own))
-    sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
-    bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
-    symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
-    torques_at = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
-    samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
-    torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
+    machine, t, samples = _moving_joints(plan)
+    bounds = limits.bounds(machine)
+    symbols = [ca.SX.sym("v", values.shape[1]) for values in samples]
+    torques_at = ca.Function("torques", symbols, [joint_torques(checked_motors("limits", machine), (*symbols,))])
+    torques = np.array(torques_at.map(len(t))(*(values.T for values in samples))).T
+    _, _, rates, accelerations = samples
     largest, demand = -np.inf, None
-    for quantity, values, most_allowed, units in (
-        ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
-        ("torque", np.abs(torques), bounds.torque, ("N m", "N")),
-        ("power", torques * sample.rates, bounds.power, ("W", "W")),
+    for quantity, values, most_allowed in (
+        ("acceleration", np.abs(accelerations), bounds.acceleration),
+        ("torque", np.abs(torques), bounds.torque),
+        ("power", torques * rates, bounds.power),
     ):
         ratios = values / most_allowed
-        row, joint = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-        if np.isfinite(most_allowed).any() and ratios[row, joint] > largest:
-            largest, name = ratios[row, joint], robot.joint_names[joint]
-            unit = units[robot.moving_joints[joint].kind == "prismatic"]
-            time, value, allowed = float(sample.t[row]), float(values[row, joint]), float(most_allowed[joint])
-            words = f"{quantity} of {name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
-            demand = Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
+        row, index = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        if np.isfinite(most_allowed).any() and ratios[row, index] > largest:
+            largest, joint = ratios[row, index], machine.robot.moving_joints[index]
+            unit = {"acceleration": f"{joint.unit}/s^2", "torque": joint.effort_unit, "power": "W"}[quantity]
+            time, value, allowed = float(t[row]), float(values[row, index]), float(most_allowed[index])
+            words = f"{quantity} of {joint.name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
+            demand = Reason(Rejection.ACTUATORS, words, joint.name, value, allowed, time)
     return demand
 
 
@@ -146,9 +149,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
             if fixed_solution.audit().passed:
                 return fixed_solution
     except SolveError as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise
-        raise _with_demand(error, largest_demand(unlimited, limits)) from error
+        _add_demand(error, largest_demand(unlimited, limits))
+        raise
     return solution
 
 
@@ -163,17 +165,15 @@ def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
     return np.asarray(rows[int((sizes > RESOLVED_SHARE * sizes.max(initial=0.0)).sum()) :])
 
 
-def _with_demand(error: SolveError, demand: Reason | None) -> SolveError:
-    """Return a copy of an error whose text also states what a motion demands of the actuators if it ignores limits."""
-    fault: Any = error
+def _add_demand(error: SolveError, demand: Reason | None) -> None:
+    """Add to the text of an error what a motion demands of the actuators if it ignores their limits."""
     words = "no motion within the actuator limits was found"
     if demand is not None:
         words += f"; without them, {demand.detail}"
         assert demand.value is not None
         assert demand.limit is not None
-        fault = demand if demand.value > demand.limit else error
-    details = {key: getattr(fault, key) for key in ("name", "value", "limit", "time")}
-    return SolveError(f"{words}\n{error}", error.solution, error.conflicts, **details)
+        vars(error).update(demand.fault if demand.value > demand.limit else {})
+    error.args = (f"{words}\n{error}",)
 
 
 def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:

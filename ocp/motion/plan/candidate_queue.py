@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
 from typing import Any
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from ocp.console import report, time_left
 from ocp.errors import SolveError
-from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage, ranked
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlannerSettings
 from ocp.solution import Solution
@@ -72,14 +71,6 @@ class Solver:
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, in which the other candidates are listed as well."""
         raise NotImplementedError
-
-
-@dataclass
-class _Motion:
-    """Motion to which several candidates converge: the first candidate, and duplicates that wait for its result."""
-
-    first: Candidate
-    waiting: list[Candidate] = field(default_factory=list)
 
 
 class CandidateQueue:
@@ -140,7 +131,7 @@ class CandidateQueue:
                 limited.
         """
         self._heap: list[tuple[float, int, int, Candidate]] = []
-        self._motions: list[_Motion] = []
+        self._motions: list[list[Candidate]] = []  # candidates of one motion: all but the first wait for its result
         self._pushed = self._failures = self._audits = 0
         self._least, self._coarse_error, self._include_costlier = np.inf, 0.0, include_costlier or self._always_costlier
         self._turned: dict[int, list[Candidate]] = {}
@@ -159,14 +150,14 @@ class CandidateQueue:
                 words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
                 self.candidates.append(candidate.with_rejection(Reason(Rejection.NOT_TRIED, words)))
             elif (motion := self._find_motion(candidate)) is not None:
-                motion.waiting.append(candidate)
+                motion.append(candidate)
             elif (reason := self._prune(candidate)) is not None:
                 self.candidates.append(candidate.with_rejection(reason))
             else:
                 self._audits += candidate.stage is Stage.REFINED
                 for advanced in self.solver.advance(candidate):
                     self._store_or_push(candidate, advanced)
-        waiting = [*(motion.waiting for motion in self._motions), *self._turned.values()]
+        waiting = [*(motion[1:] for motion in self._motions), *self._turned.values()]
         self.candidates += [each.with_rejection(Reason(Rejection.DUPLICATE)) for batch in waiting for each in batch]
 
     def plan(self) -> SolvedPlan:
@@ -177,14 +168,7 @@ class CandidateQueue:
         """
         if not self.passed:
             raise self.solver.failure(self.candidates)
-        best = min((c for c in self.candidates if c.passed), key=lambda c: c.total)
-        costlier = Reason(Rejection.COSTLIER)
-        finished = [
-            replace(candidate, reason=costlier) if candidate.passed and candidate is not best else candidate
-            for candidate in self.candidates
-        ]
-        finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.total))
-        return self.solver.plan([candidate.finished() for candidate in finished])
+        return self.solver.plan(ranked(self.candidates))
 
     @property
     def _state(self) -> str:
@@ -196,19 +180,20 @@ class CandidateQueue:
         cost = -np.inf if candidate.stage is Stage.SEED else candidate.total
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
-    def _find_motion(self, candidate: Candidate) -> _Motion | None:
-        """Return the known motion to which a candidate converged on its first mesh; None if its motion is new."""
+    def _find_motion(self, candidate: Candidate) -> list[Candidate] | None:
+        """Return the candidates of the motion to which a candidate converged on its first mesh; None for a new one."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
-        if any(motion.first.seed is candidate.seed for motion in self._motions):
+        if any(first.seed is candidate.seed for first, *_ in self._motions):
             return None
         for motion in self._motions:
-            assert motion.first.solution is not None
-            gain, slack = motion.first.total - candidate.total, self.settings.same_cost * motion.first.total
+            first = motion[0]
+            assert first.solution is not None
+            gain, slack = first.total - candidate.total, self.settings.same_cost * first.total
             is_same = gain >= -slack and not self._always_costlier
-            if gain <= slack and (is_same or self.solver.same_path(candidate.solution, motion.first.solution)):
+            if gain <= slack and (is_same or self.solver.same_path(candidate.solution, first.solution)):
                 return motion
-        self._motions.append(_Motion(candidate))
+        self._motions.append([candidate])
         return None
 
     def _prune(self, candidate: Candidate) -> Reason | None:
@@ -264,10 +249,10 @@ class CandidateQueue:
     def _resume_duplicates(self, rejected: Candidate) -> None:
         """Queue the duplicates again that waited for the result of a candidate, which was now rejected."""
         self._push_turned(rejected)
-        for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
-            self._motions.remove(motion)
-            for candidate in motion.waiting:
-                self._push(candidate)
+        same = [motion for motion in self._motions if motion[0].seed is rejected.seed]
+        self._motions = [motion for motion in self._motions if motion[0].seed is not rejected.seed]
+        for candidate in (waiting for motion in same for waiting in motion[1:]):
+            self._push(candidate)
 
     def _push_turned(self, candidate: Candidate) -> None:
         """Queue the candidates whose initial guesses differ from a given candidate's guess by full turns of joints."""

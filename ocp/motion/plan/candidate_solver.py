@@ -35,7 +35,6 @@ from ocp.motion.result.candidate import (
     Rejection,
     Seed,
     Stage,
-    collision_reason,
     shortfall_reason,
 )  # fmt: skip
 from ocp.motion.result.plan import audit_key
@@ -92,8 +91,6 @@ class CandidateSolver(Solver):
         try:
             advanced = steps[candidate.stage](candidate)
         except SolveError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
             if candidate.stage is Stage.AUDITED:
                 self.error = error
@@ -183,7 +180,7 @@ class CandidateSolver(Solver):
         if (reason := self._turned_tool_reason(candidate.solution)) is not None:
             return candidate.with_rejection(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
-        if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
+        if (deviation := self._deviations(solution).max()) > self.settings.max_deviation:
             words = (
                 f"tips deviate, or joints exceed their limits, by {deviation:.2g} (m or rad) on finer meshes as well"
             )
@@ -352,7 +349,7 @@ class CandidateSolver(Solver):
 
     def _refine_for_tasks(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
         """Refine the mesh where tips deviate or joints exceed limits, as long as that reduces the errors enough."""
-        settings, deviations = self.settings, self._deviations(motion, solution)
+        settings, deviations = self.settings, self._deviations(solution)
         for _ in range(settings.max_refinements):
             if deviations.max() <= settings.tip_tolerance:
                 break
@@ -365,31 +362,29 @@ class CandidateSolver(Solver):
             refined_solution = solve(motion.problem, finer, guess=solution, options=options, check=check)
             if not refined_solution.success:
                 raise SolveError(f"on a finer mesh: {refined_solution.status}", refined_solution)
-            previous, deviations = deviations.max(), self._deviations(motion, refined_solution)
+            previous, deviations = deviations.max(), self._deviations(refined_solution)
             if deviations.max() > max(REACH_TOLERANCE, settings.least_progress * previous):
                 break
             solution = refined_solution
         return solution
 
-    def _deviations(self, motion: ToolMotion, solution: Solution) -> Array:
+    def _deviations(self, solution: Solution) -> Array:
         """Return the largest pose error or excess over a joint limit in each mesh interval (N,), m and rad."""
-        fractions, samples = self._samples(solution), self.settings.samples_per_interval
-        sample, worst = solution.at_fraction(fractions), np.zeros(len(fractions))
-        robot = self.request.machine.robot
-        for stretch in motion.stretches:
-            joints = sample[f"joints{stretch.suffix}"]
+        robot, count = self.request.machine.robot, self.settings.samples_per_interval
+        worst = np.zeros(len(self._samples(solution)))
+        for sample in self._motion_samples(solution):
+            joints, equations = sample.joints, sample.stretch.equations
             excess = np.maximum(robot.lower - joints, joints - robot.upper)
             worst = np.maximum(worst, excess.max(axis=1, initial=0.0))
-            if stretch.equations is not None:
-                base = sample[f"base{stretch.suffix}"] if self.request.machine.base_size else None
-                times = stretch.begin + fractions * stretch.duration
-                sizes = np.cumsum([part.task.size for part in stretch.equations.bound])[:-1]
-                errors = np.split(stretch.equations.errors(times, base, joints), sizes, axis=1)
-                for part, error in zip(stretch.equations.bound, errors, strict=True):
+            if equations is not None:
+                at = sample.t, sample.base, joints
+                sizes = np.cumsum([part.task.size for part in equations.bound])[:-1]
+                errors = np.split(equations.errors(*at), sizes, axis=1)
+                for part, error in zip(equations.bound, errors, strict=True):
                     if part.task.start_gap <= self.settings.tip_tolerance:  # feedback closes a larger initial gap
                         worst = np.maximum(worst, np.linalg.norm(error, axis=1))
-                worst = np.maximum(worst, stretch.equations.cone_violations(times, base, joints).max(axis=1, initial=0))
-        return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, samples).max(axis=1))
+                worst = np.maximum(worst, equations.cone_violations(*at).max(axis=1, initial=0))
+        return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, count).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:
         """Return sample times as fractions of the horizon: several in each mesh interval, and the end."""
@@ -454,8 +449,10 @@ class CandidateSolver(Solver):
         return self._clear_counts[time]
 
     def _collision_reason(self, pair: Collision | ClosestPair, remedy: str = "") -> Reason:
+        """Return the rejection reason for two bodies that are closer to each other than the clearance."""
         assert self.request.clearance_constraints is not None
-        return collision_reason(pair, self.request.clearance_constraints.scene.clearance, remedy)
+        limit, names = self.request.clearance_constraints.scene.clearance, " and ".join(pair.bodies)
+        return Reason(Rejection.COLLISION, str(pair), names, pair.distance, limit, pair.time, remedy)
 
     # ---- results -----------------------------------------------------------------------------------------------------
 
@@ -468,9 +465,9 @@ class CandidateSolver(Solver):
         worst = min(colliding, key=lambda candidate: np.inf if np.isnan(candidate.cost) else candidate.cost).reason
         assert worst is not None
         alternatives = () if worst.time is None else describe_alternatives(self._count_clear_at(worst.time))
-        words = "; ".join([f"{error}\nthe lowest-cost candidate in collision: {worst.detail}", *alternatives])
-        details = {key: getattr(worst, key) for key in ("name", "value", "limit", "time")}
-        return SolveError(words, error.solution, error.conflicts, candidates, **details)
+        error.args = ("; ".join([f"{error}\nthe lowest-cost candidate in collision: {worst.detail}", *alternatives]),)
+        vars(error).update(worst.fault)
+        return error
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, in which the other candidates are listed as well."""

@@ -343,7 +343,7 @@ class _StandingSolver(Solver):
         try:
             solution = solve_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
         except (ProblemError, SolveError) as error:
-            if self.start_is_fixed or isinstance(error.__cause__, KeyboardInterrupt):
+            if self.start_is_fixed:
                 raise
             return [candidate.with_rejection(Reason.of_error(Rejection.INFEASIBLE, error))]
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]

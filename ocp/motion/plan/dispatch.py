@@ -39,8 +39,7 @@ from ocp.motion.result.margin import LOADS, checked_uncertainty, tightened_torqu
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
 from ocp.motion.result.request import RESERVE, request_of
-from ocp.motion.result.segmented_plan import ConsecutivePlans, SegmentedPlan, SequencePlan
-from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
+from ocp.motion.result.segmented_plan import ConsecutivePlans, SegmentedPlan, SequencePlan, solved_plan_of
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
@@ -212,12 +211,9 @@ def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, optio
         try:
             result = _plan(machine, tasks, horizon, scene, replace(options, limits=own))
         except SolveError as error:
-            words = (
-                f"obstacles enlarged by {reserve['distance']:g} m and torque limits {tightened.tolist()} leave room "
-            )
-            words += f"for the uncertainties, but {error}"
-            fields = {key: getattr(error, key) for key in ("name", "value", "limit", "time")}
-            raise SolveError(words, error.solution, **fields) from error
+            words = f"obstacles enlarged by {reserve['distance']:g} m and torque limits {tightened.tolist()} leave "
+            error.args = (f"{words}room for the uncertainties, but {error}",)
+            raise
         parts = [piece.plan for piece in result.pieces] if isinstance(result, ConsecutivePlans) else [result]
         for problem in (part.solution.problem for part in parts):
             if (request := request_of(problem)) is not None:
@@ -378,4 +374,4 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     for kind in (SegmentedPlan, SequencePlan):
         if kind.kind in arrays:
             return kind.of_arrays(path, arrays)
-    return (PhasedPlan if PHASED in arrays else SolvedPlan).of_arrays(path, arrays)
+    return solved_plan_of(path, arrays)

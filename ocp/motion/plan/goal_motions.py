@@ -37,7 +37,7 @@ from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.sampling.joint_paths import StraightMotions, path_length, points_along, shortest_through_corners
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings
-from ocp.motion.sampling.spline_motion import MotionLimits, SplineCost, SplineMotionSettings, optimal_motion_near
+from ocp.motion.sampling.spline_motion import MotionLimits, SplineMotionSettings, has_spline_cost, optimal_motion_near
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -94,7 +94,7 @@ class GoalRequest:
         goals: Configurations that each satisfy the goal. Shape (K, n), or (n,) for one.
         horizon: Final time, s; None: as short as the limits of the rates allow for the path, or free if the cost
             weights time.
-        limits: Limits of joints and actuators; the robot's own positions and rates if None.
+        limits: Limits of joints and actuators.
         cost: Weights of the cost. With velocity or length alone, and without actuator limits, the motion has constant
             speed; else it is smooth. The weights of the joints are the metric of joint space.
         start_velocity, end_velocity: "rest", "free", or the joint velocities there, shape (n,). For smooth motions.
@@ -108,7 +108,7 @@ class GoalRequest:
     start: Any
     goals: Any
     horizon: float | None = None
-    limits: Limits | None = None
+    limits: Limits = field(default_factory=Limits)
     cost: Cost = field(default_factory=Cost)
     start_velocity: Any = "rest"
     end_velocity: Any = "rest"
@@ -136,13 +136,10 @@ class GoalTask:
     torques: TorqueLimits
 
     @property
-    def limits(self) -> Limits:
-        return self.request.limits or Limits()
-
-    @property
     def is_dynamic(self) -> bool:
         """Whether joint velocities must be continuous, due to actuator limits, the cost, or velocities at the ends."""
-        return limits_actuators(self.limits) or not set(self.request.cost.terms) <= {"velocity", "length"} or self.moves
+        terms = set(self.request.cost.terms)
+        return limits_actuators(self.request.limits) or not terms <= {"velocity", "length"} or self.moves
 
     @property
     def moves(self) -> bool:
@@ -153,11 +150,6 @@ class GoalTask:
     def end_velocities(self) -> tuple[Any, Any]:
         """Requested joint velocities at the start and at the end."""
         return self.request.start_velocity, self.request.end_velocity
-
-    @property
-    def spline_cost(self) -> SplineCost | None:
-        """Cost of a motion along splines; None if the requested cost has terms that splines do not support."""
-        return SplineCost.of(self.request.cost, len(self.start))
 
     @property
     def is_fastest(self) -> bool:
@@ -230,19 +222,18 @@ def _spline_candidate(task: GoalTask, path: JointPath, horizon: float | None) ->
     """Return an audited, locally optimal spline near a path; the horizon is free if it is None."""
     settings = task.request.settings.spline
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
-    limits, cost = MotionLimits(task.motions, task.bounds, task.torques, *ends), task.spline_cost
-    assert cost is not None
+    limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
     try:
         for _ in range(task.request.settings.margins):
             with task.request.limited(task.request.settings.search_share * time_left()):
-                motion = optimal_motion_near(limits, path.joints, cost, horizon, settings=settings)
+                motion = optimal_motion_near(limits, path.joints, task.request.cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
             report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
             settings = replace(settings, margin=2 * settings.margin)
     except (SolveError, TimeLimitReached) as error:
-        candidate = Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+        candidate = Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error))
     return candidate
 
 
@@ -258,7 +249,7 @@ def _candidates_within_limits(task: GoalTask, paths: list[JointPath]) -> list[Ca
             motions.append((path, stopping_motion(corners, bounds, task.torques)))
         except (SolveError, TimeLimitReached) as error:
             reason = Reason.of_error(Rejection.ACTUATORS, error)
-            candidates.append(Candidate(path.joints[0], reason=reason, stage=Stage.SEED))
+            candidates.append(Candidate(path.joints[0], reason=reason))
     is_free = request.horizon is None and request.cost.time > 0
     shortest = min((motion.duration for _, motion in motions), default=0.0)
     fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
@@ -331,7 +322,7 @@ class _PathProblem:
 
     def without_stops(self) -> Candidate:
         """Return a locally optimal motion without stops near the path, with its audit."""
-        if self.task.spline_cost is not None and not self.task.is_fastest:
+        if has_spline_cost(self.task.request.cost) and not self.task.is_fastest:
             spline = _spline_candidate(self.task, self.path, self.fixed)
             if spline.passed:
                 return spline
@@ -352,9 +343,7 @@ class _PathProblem:
         try:
             solution = within_limits(self.declare, constraints, machines, guess=guess)
         except (SolveError, TimeLimitReached) as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise
-            return Candidate(joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
+            return Candidate(joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error))
         return _audit_candidate(task, solution, self.path)
 
 

@@ -30,7 +30,7 @@ from ocp.motion.plan.goal_motions import (
     motions_along,
     synchronised_candidates,
 )
-from ocp.motion.result.candidate import Candidate, Reason, Rejection
+from ocp.motion.result.candidate import Candidate, ranked
 from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.sampling.joint_paths import StraightMotions, optimise_length
 from ocp.motion.sampling.path_search import JointPath, TreeSearch, find_paths, search_paths
@@ -95,8 +95,8 @@ def _find_candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 def _check_request(request: GoalRequest) -> GoalTask:
     """Return a checked request, with goals shifted towards the start by full turns of the unlimited joints."""
     machine = require.instance("machine", request.machine, FixedBase)
-    limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
-    bounds = limits.bounds(machine)  # the problem that is declared warns of unknown limits
+    # the problem that is declared warns of unknown limits
+    bounds = require.instance("limits", request.limits, Limits).bounds(machine)
     unlimited = np.isinf([bounds.velocity, bounds.acceleration, bounds.jerk, bounds.torque]).all(axis=0)
     bounds = bounds._replace(velocity=np.where(unlimited, request.settings.unlimited_rate, bounds.velocity))
     if request.horizon is not None:
@@ -191,16 +191,17 @@ def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
-    search = TreeSearch(task.motions, np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper), task.scale)
+    range_of_samples = np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper)
+    search = TreeSearch(task.motions, task.start, task.goals, *range_of_samples, task.scale)
     share = request.settings.search_share
     shared: dict[str, Any] = {"seed": request.seed, "settings": request.settings.search}
     reason, name, has_path = "in all random searches", "search", False
     try:
         if task.is_fastest:
-            paths = search_paths(search, task.start, task.goals, **shared)
+            paths = search_paths(search, **shared)
         else:
             with request.limited(share * seconds):
-                paths = iter(find_paths(search, task.start, task.goals, limits=(bounds.lower, bounds.upper), **shared))
+                paths = iter(find_paths(search, limits=(bounds.lower, bounds.upper), **shared))
         while True:
             with request.limited(share * time_left()):
                 path = next(paths, None)
@@ -230,22 +231,15 @@ def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
 
 def _plan_of_best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
     """Return the plan of the lowest-cost candidate, with a cost bound, or raise SolveError if no candidate passed."""
-    passed = sorted((c for c in candidates if c.passed), key=lambda candidate: candidate.cost)
-    if not passed:
+    if not any(candidate.passed for candidate in candidates):
         reasons = "\n".join(f"  {candidate.reason}" for candidate in candidates)
         first = candidates[0].reason
-        details: dict[str, Any] = (
-            {} if first is None else {"name": first.name, "value": first.value, "limit": first.limit}
-        )
         words = f"none of the {len(candidates)} collision-free paths led to a motion that passes its audit:\n{reasons}"
-        raise SolveError(words, candidates[0].solution, (), **details)
-    best = passed[0]
-    costlier = [c.with_rejection(Reason(Rejection.COSTLIER, value=c.cost, limit=best.cost)) for c in passed[1:]]
-    failed = [candidate for candidate in candidates if not candidate.passed]
-    assert best.solution is not None
-    listed = tuple(candidate.finished() for candidate in (best, *costlier, *failed))
-    horizon = best.solution.horizon
-    parts = (Part(0.0, horizon, ""),)
-    bound = cost_bound(task, horizon)
-    bound = None if bound is None else checked_bound(bound, best.cost)
-    return SolvedPlan(task.request.machine, best.solution, parts, listed, bound)
+        raise SolveError(words, candidates[0].solution, **({} if first is None else first.fault))
+    listed = ranked(candidates)
+    solution = listed[0].solution
+    assert solution is not None
+    bound = cost_bound(task, solution.horizon)
+    bound = None if bound is None else checked_bound(bound, solution.cost)
+    parts = (Part(0.0, solution.horizon, ""),)
+    return SolvedPlan(task.request.machine, solution, parts, tuple(listed), bound)

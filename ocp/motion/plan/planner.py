@@ -18,10 +18,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from models import CollisionScene, Machine, ModelError
+from models import CollisionScene, Machine
 from models.checks import Array
 from ocp.console import report
-from ocp.errors import ProblemError, SolveError, require
+from ocp.errors import ProblemError, SolveError, problem_errors, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import checked_motors
 from ocp.motion.builders.tool_motion import stretches_of
@@ -31,6 +31,7 @@ from ocp.motion.plan.actuators import cost_of_motion, limits_actuators, weights_
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
+from ocp.motion.result.path_plan import UNLIMITED_RATE
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
@@ -56,9 +57,6 @@ from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
-
-UNLIMITED_RATE = 1.0
-"""Rate assumed for joints without a rate limit when the cost of an approach is estimated, rad/s or m/s."""
 
 
 def plan_from_configurations(
@@ -342,25 +340,31 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
 
 
 def clearance_for(
-    machine: Machine, limits: Limits | None, scene: Scene | Literal[False] | None
+    machine: Machine, limits: Limits | None, scene: Scene | Literal[False] | None, *, why_static: str = ""
 ) -> ClearanceConstraints | None:
     """Return the clearance constraints of a motion in a scene; None if no pair of bodies needs a check.
 
+    Args:
+        machine, limits, scene: As in `plan`.
+        why_static: Why no obstacle may move, as the text of an error; "" if obstacles may move.
+
     Raises:
-        ProblemError: A value of the scene is invalid, or does not fit the machine.
+        ProblemError: A value of the scene is invalid, or does not fit the machine; or an obstacle may not move.
     """
     if scene is False:
         return None
     own = Scene() if scene is None else require.instance("scene", scene, Scene)
     joint_limits = not isinstance(limits, Limits) or limits.joints
     report("collision scene")
-    try:
+    with problem_errors():
         collision_scene = CollisionScene(
             machine, own.obstacles, own.clearance, own.ignored, own.srdf, own.folders, own.missing, joint_limits
         )
-    except ModelError as error:
-        raise ProblemError(str(error), **vars(error)) from error
-    return ClearanceConstraints(collision_scene) if len(collision_scene.pairs) else None
+    if not len(collision_scene.pairs):
+        return None
+    if why_static and collision_scene.has_moving_obstacles:
+        raise ProblemError(why_static, name="obstacles", value=collision_scene.obstacles)
+    return ClearanceConstraints(collision_scene)
 
 
 @dataclass(frozen=True)

@@ -206,11 +206,8 @@ class _Sequence:
 
     def _constraints(self) -> ClearanceConstraints | None:
         """Return the clearance constraints of the machine in its scene; raise ProblemError if an obstacle moves."""
-        constraints = clearance_for(self.machine, self.options.limits, self.scene)
-        if constraints is not None and constraints.scene.has_moving_obstacles:
-            words = "obstacles of a sequence may not move, since it is not known when each part begins"
-            raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
-        return constraints
+        words = "obstacles of a sequence may not move, since it is not known when each part begins"
+        return clearance_for(self.machine, self.options.limits, self.scene, why_static=words)
 
 
 def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
@@ -285,10 +282,8 @@ def plan_in_segments(
         SolveError: No segment could be planned, however the tasks were divided.
     """
     request = checked_request(machine, tasks, horizon, replace(options, search="global"))
-    constraints = clearance_for(machine, options.limits, scene)
-    if constraints is not None and constraints.scene.has_moving_obstacles:
-        words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
-        raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
+    words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
+    constraints = clearance_for(machine, options.limits, scene, why_static=words)
     whole = replace(request, clearance_constraints=constraints)
     request, configurations = place_held_joints(whole, hold_idle_joints(whole))
     if request.start is None:
@@ -308,8 +303,6 @@ def plan_in_segments(
             try:
                 plans[begin, end] = _plan_segment(request, begin, end)
             except (SolveError, Unreachable) as failed:
-                if isinstance(failed.__cause__, KeyboardInterrupt):
-                    raise
                 error = failed
                 excluded.append((begin, end))
                 break
@@ -361,7 +354,5 @@ def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, afte
     try:
         motion = replace(plan_to_goal(goal), machine=whole, held=request.held)
     except (ProblemError, SolveError) as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise
         return Reconfiguration(time, before, after, None, str(error).split("\n")[0])
     return Reconfiguration(time, before, after, motion)

@@ -134,10 +134,8 @@ def plan_path(
     if not joint_weights.any():
         words = "cost: no joint adds to it; give a joint a velocity limit for the time, or a weight for the length"
         raise ProblemError(words, name="velocity" if is_timed else "weights", value=joint_weights)
-    constraints = clearance_for(machine, checked_limits, scene)
-    if constraints is not None and constraints.scene.has_moving_obstacles:
-        words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
-        raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
+    words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
+    constraints = clearance_for(machine, checked_limits, scene, why_static=words)
     cost_of_steps = (LargestMotion if is_timed else PathLength)(joint_weights)
     planner = _WaypointPlanner(machine, poses, cost_of_steps, checked_limits, constraints, int(options.seed))
     return planner.plan(waypoints.reconfigurations == "counted")

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from models.checks import ROUNDING, Array
 from ocp.audit.audit import Audit
-from ocp.audit.clearance import ClosestPair
 from ocp.console import TimeLimitReached
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch
-from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import describe_miss
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.configurations import PlanRequest
@@ -72,6 +70,11 @@ class Reason:
     time: float | None = None
     remedy: str = ""
 
+    @property
+    def fault(self) -> dict[str, Any]:
+        """Name, value, limit and time of the offending item, as fields of an exception."""
+        return {name: getattr(self, name) for name in ("name", "value", "limit", "time")}
+
     def __str__(self) -> str:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
@@ -99,11 +102,6 @@ class Reason:
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **details)
-
-
-def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
-    """Return the rejection reason for two bodies that are closer to each other than the clearance `limit`, m."""
-    return Reason(Rejection.COLLISION, str(pair), " and ".join(pair.bodies), pair.distance, limit, pair.time, remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +219,18 @@ class Candidate:
         return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)
 
 
+def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return finished candidates, the lowest-cost one that passed first, then by rising cost.
+
+    Other candidates that passed are rejected, because they cost more.
+    """
+    best = min((c for c in candidates if c.passed), key=lambda c: c.total)
+    costlier = Reason(Rejection.COSTLIER, limit=best.cost)
+    order = sorted(candidates, key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.total))
+    rejected = [replace(c, reason=c.reason or replace(costlier, value=c.cost)) for c in order[1:]]
+    return [candidate.finished() for candidate in (best, *rejected)]
+
+
 @dataclass(frozen=True)
 class SingularSettings:
     """Thresholds below which a motion counts as nearly singular, and a joint as being at a limit.
@@ -303,15 +313,15 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
     reasons = []
     for sample in samples:
         shares = _rate_shares(request, sample.rates)
-        k, joint = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
-        if shares[k, joint] > 1 + SINGULAR.at_limit:
-            name, unit = _joint_name_and_unit(request, joint)
-            rate, limit = float(abs(sample.rates[k, joint])), float(request.bounds.velocity[joint])
+        k, index = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
+        if shares[k, index] > 1 + SINGULAR.at_limit:
+            joint, time = request.machine.robot.moving_joints[index], float(sample.t[k])
+            rate, limit = float(abs(sample.rates[k, index])), float(request.bounds.velocity[index])
             words = (
-                f"at {sample.t[k]:.4g} s {name!r} would have to move at {rate:.4g} {unit}/s, its limit is {limit:.4g} "
-                f"{unit}/s; lengthen the horizon or start elsewhere"
+                f"at {time:.4g} s {joint.name!r} would have to move at {rate:.4g} {joint.unit}/s, its limit is "
+                f"{limit:.4g} {joint.unit}/s; lengthen the horizon or start elsewhere"
             )
-            reasons.append((rate / limit, Reason(Rejection.INFEASIBLE, words, name, rate, limit, float(sample.t[k]))))
+            reasons.append((rate / limit, Reason(Rejection.INFEASIBLE, words, joint.name, rate, limit, time)))
     return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
 
 
@@ -329,34 +339,25 @@ def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> R
         if distances[i] + angles[i] > sum(misses):
             sample, k, misses = each, i, (float(distances[i]), float(angles[i]))
     bounds, joints, time = request.bounds, sample.joints[k], float(sample.t[k])
+    moving = request.machine.robot.moving_joints
     words = f"at {time:.4g} s the tip misses its task by {describe_miss(*misses)}"
     with np.errstate(invalid="ignore"):
         slack = np.nan_to_num(SINGULAR.at_limit * (bounds.upper - bounds.lower), nan=0.0, posinf=0.0)
     for limits in (bounds.lower, bounds.upper):
-        for joint in np.flatnonzero(np.abs(joints - limits) <= slack).tolist():
-            name, unit = _joint_name_and_unit(request, joint)
-            words = (
-                f"{words}, with {name!r} at its limit {limits[joint]:.5g} {unit}; start elsewhere or leave a row free"
-            )
-            return Reason(Rejection.INFEASIBLE, words, name, float(joints[joint]), float(limits[joint]), time)
+        for index in np.flatnonzero(np.abs(joints - limits) <= slack).tolist():
+            name, value, limit = moving[index].name, float(joints[index]), float(limits[index])
+            how = f"at its limit {limit:.5g} {moving[index].unit}"
+            words += f", with {name!r} {how}; start elsewhere or leave a row free"
+            return Reason(Rejection.INFEASIBLE, words, name, value, limit, time)
     shares = _rate_shares(request, sample.rates[k])
-    fastest = int(shares.argmax())
-    name, unit = _joint_name_and_unit(request, fastest)
-    value, limit = float(abs(sample.rates[k, fastest])), float(bounds.velocity[fastest])
-    at_limit = shares[fastest] >= 1 - SINGULAR.at_limit
-    words += (
-        f", with {name!r} {'at the limit of its rate' if at_limit else 'as the fastest joint'}, {value:.4g} {unit}/s"
-    )
-    return Reason(Rejection.INFEASIBLE, f"{words}; lengthen the horizon or start elsewhere", name, value, limit, time)
+    index = int(shares.argmax())
+    name, value, limit = moving[index].name, float(abs(sample.rates[k, index])), float(bounds.velocity[index])
+    how = "at the limit of its rate" if shares[index] >= 1 - SINGULAR.at_limit else "as the fastest joint"
+    words += f", with {name!r} {how}, {value:.4g} {moving[index].unit}/s; lengthen the horizon or start elsewhere"
+    return Reason(Rejection.INFEASIBLE, words, name, value, limit, time)
 
 
 def _rate_shares(request: PlanRequest, rates: Array) -> Array:
     """Return absolute joint rates as fractions of the rate limits; the fraction is zero for a joint at rest."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
-
-
-def _joint_name_and_unit(request: PlanRequest, joint: int) -> tuple[str, str]:
-    """Return the name of a joint, and the unit of its position."""
-    moving = request.machine.robot.moving_joints[joint]
-    return moving.name, "m" if moving.kind == "prismatic" else "rad"

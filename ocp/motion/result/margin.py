@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -34,8 +35,7 @@ from ocp.motion.result.plan import CHECKED_TIMES, Plan
 from ocp.motion.result.request import RESERVE, request_of
 from ocp.motion.result.segmented_plan import ConsecutivePlans
 from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan
-from ocp.motion.search.held_joints import all_joints
-from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, JointBounds, Limits
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits
 from ocp.problem.hulls import WORLD
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
@@ -80,6 +80,7 @@ class Requirements(NamedTuple):
         slack: Distance from the limit for a motion as modelled, in the unit of the limit. Shape (M,).
         coefficients: By uncertainty, the largest decrease of the slack for each unit of size, not negative. Shape (M,).
         most: The limit.
+        joint: Name of the joint whose torque is limited; "" for other quantities.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Requirements(NamedTuple):
     slack: Array
     coefficients: Mapping[str, Array]
     most: float = 0.0
+    joint: str = ""
 
     def coefficient(self, uncertainty: str) -> Array:
         """Return the coefficients of an uncertainty, zero if the requirement does not depend on it. Shape (M,)."""
@@ -266,13 +268,12 @@ def tightened_torques(plan: Plan, sizes: Mapping[str, float]) -> dict[str, float
     """
     largest: dict[str, float] = {}
     for row in _requirements(plan, None):
-        kind, _, joint = row.name.rpartition(": ")[2].partition(" of ")
-        if kind == "torque":
+        if row.joint:
             needed = np.sum([row.coefficient(name) * size for name, size in sizes.items()], axis=0)
             torque = row.most - row.slack
             short = (needed > row.slack) & (torque > 0)
             targets = (1 - TIGHTENING_SHARE) * row.most * torque[short] / (torque + needed)[short]
-            largest[joint] = min(largest.get(joint, np.inf), float(targets.min(initial=np.inf)))
+            largest[row.joint] = min(largest.get(row.joint, np.inf), float(targets.min(initial=np.inf)))
     return {joint: torque for joint, torque in largest.items() if np.isfinite(torque)}
 
 
@@ -318,10 +319,7 @@ def _distance_requirements(plan: Plan) -> list[Requirements]:
         separations = list(problem.declared.apart.items())
         request = request_of(problem)
         reserve = 0.0 if request is None else float(request.arguments.get(RESERVE, {}).get("distance", 0.0))
-
-        def prove(name: str, pairs: list[int]) -> Clearance | None:
-            return clearance_of_pairs(problem, plan.solution, name, pairs)
-
+        prove = partial(clearance_of_pairs, problem, plan.solution)
     tip, rows = plan.machine.robot.tip, list[Requirements]()
     for name, separation in separations:
         groups: dict[tuple[str, ...], list[int]] = {}
@@ -350,22 +348,21 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
         machine: Machine that moves in this part, with its load.
         part: The part. Its joints are those of the first machine of the plan, in any order.
     """
-    robot = machine.robot
-    if isinstance(machine, Stance) or robot.total_mass == 0:
+    if isinstance(machine, Stance) or machine.robot.total_mass == 0:
         return []
+    machine = hold_joints(machine, plan.held) if plan.held else machine
+    robot = machine.robot
+    columns = [plan.names.index(name) for name in robot.joint_names]
     arguments: Mapping[str, Any] = {} if plan.request is None else plan.request.arguments
     limits = arguments.get("limits") or Limits()
-    own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
-    bounds = JointBounds(*(all_joints(robot, dict.fromkeys(plan.held, np.inf), values) for values in own))
-    declared = arguments.get(RESERVE, {}).get("torque", bounds.torque)
-    bounds = bounds._replace(torque=np.where([name in plan.held for name in robot.joint_names], np.inf, declared))
+    bounds, reserve = limits.bounds(machine), arguments.get(RESERVE, {})
+    bounds = bounds._replace(torque=reserve["torque"][columns]) if reserve else bounds
     grid = plan.t[(plan.t >= part.begin) & (plan.t <= part.end)]
     grid = np.union1d(grid, [part.begin, part.end])
     count = max(SAMPLES_PER_STEP, -(-CHECKED_TIMES // len(grid)))
     nodes = np.clip(np.linspace(0.0, 1.0, count + 1), INSIDE, 1 - INSIDE)
     times = grid[:-1, None] + np.diff(grid)[:, None] * nodes
     sample = plan.sampled(times.ravel())
-    columns = [plan.names.index(name) for name in robot.joint_names]
     motion = [values[:, columns] for values in (sample.joints, sample.rates, sample.accelerations)]
     bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((len(sample.t), 0))
     nominal, loaded, reaction, loaded_reaction = _loads(machine, arguments)(bases, *motion, sample.t[:, None])
@@ -377,19 +374,21 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
         bends = np.abs(np.diff(steps, n=2, axis=1)).max(axis=1, keepdims=True)
         return np.asarray((steps + bends).reshape(values.shape))
 
-    def add(name: str, most: float, value: Array, change: Array, friction: Array | None = None) -> None:
+    def add(
+        name: str, most: float, value: Array, change: Array, friction: Array | None = None, joint: str = ""
+    ) -> None:
         """Add the requirement value + payload times change + share of friction <= most, unless this is infinite."""
         if np.isfinite(most):
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})
             growth = {key: np.where(part > ROUNDING_SHARE * size, part, 0.0) for key, part in growth.items()}
-            rows.append(Requirements(name, sample.t, most - bounded(value), growth, most))
+            rows.append(Requirements(name, sample.t, most - bounded(value), growth, most, joint))
 
     change, rates = loaded - nominal, motion[1]
     for joint, name in enumerate(robot.joint_names):
         torque, added, most = nominal[:, joint], change[:, joint], float(bounds.torque[joint])
         for sign in (1.0, -1.0):
-            add(f"torque of {name}", most, sign * torque, sign * added, np.full(len(torque), most))
+            add(f"torque of {name}", most, sign * torque, sign * added, np.full(len(torque), most), name)
         friction = np.abs(rates[:, joint]) * (most if np.isfinite(most) else 0.0)
         powers = torque * rates[:, joint], added * rates[:, joint]
         add(f"power of {name}", float(bounds.power[joint]), *powers, friction)

@@ -32,7 +32,7 @@ POSE_TOLERANCE = 1e-6
 STEP_TOLERANCE = 1e-6
 """Largest excess over a joint limit or over the largest step between waypoints, rad or m."""
 UNLIMITED_RATE = 1.0
-"""Rate that is assumed for joints without velocity limits when a path is timed, rad/s or m/s."""
+"""Rate that is assumed for joints without velocity limits when a path is timed or compared, rad/s or m/s."""
 SAVED = "cost that displacements would save"
 """Name of the finding about the first-order conditions: what small displacements would save, relative to the cost."""
 

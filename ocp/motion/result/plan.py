@@ -211,7 +211,7 @@ class Plan(ABC):
 
     def _unit(self, joint: int) -> str:
         """Return the unit of a joint's position."""
-        return ("rad", "m")[self.machine.robot.moving_joints[joint].kind == "prismatic"]
+        return self.machine.robot.moving_joints[joint].unit
 
     def margin(self, uncertainty: Mapping[str, Any] | None = None, tolerance: float | None = None) -> Any:
         """Return how far payload, friction and placements may differ from the model before the plan breaks a limit.

@@ -15,16 +15,12 @@ import casadi as ca
 import numpy as np
 
 from models import (
-    Box,
-    Capsule,
     CollisionScene,
     CollisionShape,
-    Cylinder,
     FixedBase,
     Foot,
     Foothold,
     FreeFloating,
-    HalfSpace,
     Joint,
     Link,
     Machine,
@@ -33,7 +29,6 @@ from models import (
     ModelError,
     MovingObstacle,
     Robot,
-    Sphere,
     Stance,
     Standing,
     Support,
@@ -41,6 +36,7 @@ from models import (
 )
 from models.machines.machine import hold_joints
 from models.shapes.bodies import Body, LinkMesh
+from models.shapes.shapes import SHAPE_KINDS
 from models.spatial import expression
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -61,14 +57,13 @@ from ocp.problem.problem import Problem
 from ocp.problem.record_reader import RECORD_ERRORS, FunctionReader
 from ocp.problem.record_writer import FunctionWriter
 
-SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
 STANDING = (Weights, FreeTime, InFoot, Pinned, IndexAtLeast, StandingSetup)
 STEPS = (Steps, StancePhase, StepWeights, Foot, Foothold)
 DYNAMICS = (Actuation, ClearanceConstraints, JointFriction, DynamicsSetup, Capture, Cone, Grasp)
 ARGUMENTS = (TipTask, Goal, Start, Limits, Cost, *DYNAMICS, *STANDING, *STEPS)
 MACHINES = (FixedBase, FreeFloating, Standing, Stance)
-KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
+KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPE_KINDS, *ARGUMENTS, MovingObstacle, Body)}
 RESERVE = "reserve"
 """Name among the arguments of a request under which robust plans store by how much the problem is stricter than the
 plan must be: the "distance" by which obstacles are enlarged, m, and the "torque" limits of the joints, shape (n,)."""

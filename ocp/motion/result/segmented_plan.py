@@ -259,14 +259,14 @@ class SequencePlan(ConsecutivePlans):
         with reading_plan(path):
             head = read_record(path, arrays, cls.kind)
             phases = tuple(str(name) for name in head["phases"])
-            parts = tuple(_plan_of(path, arrays, f"part {number}/") for number in range(len(phases)))
+            parts = tuple(solved_plan_of(path, arrays, f"part {number}/") for number in range(len(phases)))
             machine, smooth = parts[0].machine, head["smooth"]
             if not all(plan.names == parts[0].names for plan in parts) or not isinstance(smooth, bool):
                 raise ValueError("its motions do not fit together")
             return cls(machine, parts, phases, smooth)
 
 
-def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str) -> SolvedPlan:
+def solved_plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str = "") -> SolvedPlan:
     """Build one of the plans in a file from the arrays whose names begin with a prefix."""
     own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
     return (PhasedPlan if PHASED in own else SolvedPlan).of_arrays(path, own)
@@ -375,11 +375,11 @@ class SegmentedPlan(ConsecutivePlans):
         with reading_plan(path):
             head = read_record(path, arrays, cls.kind)
             times = tuple(float(time) for time in head["start_times"])
-            segments = tuple(_plan_of(path, arrays, f"segment {number}/") for number in range(len(times)))
+            segments = tuple(solved_plan_of(path, arrays, f"segment {number}/") for number in range(len(times)))
             changes = tuple(
                 Reconfiguration(
                     *(float(time), np.asarray(before, dtype=float), np.asarray(after, dtype=float)),
-                    *(_plan_of(path, arrays, f"reconfiguration {number}/") if has_motion else None, str(failure)),
+                    *(solved_plan_of(path, arrays, f"reconfiguration {number}/") if has_motion else None, str(failure)),
                 )
                 for number, (time, before, after, has_motion, failure) in enumerate(head["reconfigurations"])
             )

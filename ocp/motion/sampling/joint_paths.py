@@ -176,10 +176,7 @@ class StraightMotions:
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
         """Return the frames of all bodies on K straight motions, at one fraction of the length of each motion."""
         starts, ends = lines[0][motion], lines[1][motion]
-        return self._frames(starts + places[:, None] * (ends - starts))
-
-    def _frames(self, joints: Array) -> Frames:
-        """Return the frames of the bodies in configurations (M, n)."""
+        joints = starts + places[:, None] * (ends - starts)
         base = np.broadcast_to(self.scene.machine.base_home(), (len(joints), 0))  # type: ignore[union-attr]
         return frames_of(self._placements(base, joints, np.zeros((len(joints), 1)))[0])
 
@@ -233,14 +230,10 @@ def shorten(motions: StraightMotions, path: Array, scale: Array, *, random: np.r
     for _ in range(SHORTENING.most_batches):
         if len(path) == 2:
             break
-        path = shortest_through_corners(
-            motions, _apply_shortcuts(motions, path, scale, random, SHORTENING.batch), lengths_of
-        )
+        path = shortest_through_corners(motions, _apply_shortcuts(motions, path, scale, random), lengths_of)
         lengths.append(path_length(path, scale))
-        if (
-            len(lengths) > SHORTENING.patience
-            and lengths[-1] > (1 - SHORTENING.least_gain) * lengths[-1 - SHORTENING.patience]
-        ):
+        before = lengths[-1 - SHORTENING.patience] if len(lengths) > SHORTENING.patience else np.inf
+        if lengths[-1] > (1 - SHORTENING.least_gain) * before:
             break
     return path
 
@@ -285,12 +278,10 @@ def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Ca
     return path[corners[::-1]]
 
 
-def _apply_shortcuts(
-    motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int
-) -> Array:
+def _apply_shortcuts(motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator) -> Array:
     """Replace parts of a path by straight shortcuts between random points; the best shortcuts are applied first."""
     places = _places(path, scale)
-    ends = np.sort(random.random((batch, 2)) * places[-1], axis=1)
+    ends = np.sort(random.random((SHORTENING.batch, 2)) * places[-1], axis=1)
     begins, stops = (points_along(path, scale, ends[:, side] / places[-1]) for side in (0, 1))
     gains = ends[:, 1] - ends[:, 0] - np.linalg.norm((stops - begins) * scale, axis=1)
     tried = np.flatnonzero(gains > 1e-9 * places[-1])
@@ -364,7 +355,7 @@ def optimise_length(motions: StraightMotions, path: Array, scale: Array, *, limi
     for _ in range(OPTIMISATION.most_steps):
         check_time()
         step = _length_step(motions, chain, scale, limits, inertia)
-        moved, shares = _clear_step(motions, chain, chain + step, OPTIMISATION.smallest_share)
+        moved, shares = _clear_step(motions, chain, chain + step)
         length = path_length(moved, scale)
         gain = 1 - length / best_length
         if gain > 0:
@@ -435,8 +426,7 @@ def _length_step(
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
     """Return the point z nearest to a target in a polyhedron, `rows` z >= `least`, that contains the origin."""
     needed = least - rows @ target
-    active = np.flatnonzero(needed > -np.inf)
-    if not len(active) or needed.max() <= 0:
+    if needed.max(initial=0.0) <= 0:
         return target
     size = float(np.abs(needed).max())
     matrix = np.vstack([rows.T, needed[None] / size])
@@ -448,7 +438,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
     return np.asarray(target - residual[:-1] / residual[-1] * size)
 
 
-def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
+def _clear_step(motions: StraightMotions, chain: Array, moved: Array) -> tuple[Array, Array]:
     """Shorten the displacements of a path's corners until the moved path is collision-free.
 
     Return the moved path, and the fractions of the displacements by which its corners are moved.
@@ -460,4 +450,4 @@ def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: 
         if not blocked.any():
             return trial, shares
         ends = np.append(blocked, False) | np.append(False, blocked)
-        shares = np.where(ends, np.where(shares > smallest, shares / 2, 0.0), shares)
+        shares = np.where(ends, np.where(shares > OPTIMISATION.smallest_share, shares / 2, 0.0), shares)

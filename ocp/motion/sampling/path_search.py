@@ -32,20 +32,10 @@ from ocp.motion.sampling.joint_paths import (
 Indices = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class RandomTreeSettings:
-    """Settings of the growth of random trees.
-
-    Attributes:
-        batch: Number of random configurations towards which a tree grows at once.
-        longest: Longest edge, as a share of the diagonal of the sampled range of configurations.
-    """
-
-    batch: int = 16
-    longest: float = 0.05
-
-
-TREES = RandomTreeSettings()
+TREE_BATCH = 16
+"""Number of random configurations towards which a tree grows at once."""
+LONGEST_EDGE_SHARE = 0.05
+"""Longest edge of a tree, as a share of the diagonal of the sampled range of configurations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +44,22 @@ class TreeSearch:
 
     Attributes:
         motions: Proofs of clearance.
+        start, goals: Configurations, which keep the clearance. Shapes (n,), (K, n), rad or m.
         lower, upper: Range from which configurations are sampled; it contains start and goals. Shape (n,), rad or m.
         scale: Distances are lengths of scale * dq. Shape (n,).
     """
 
     motions: StraightMotions
+    start: Array
+    goals: Array
     lower: Array
     upper: Array
     scale: Array
+
+    def path(self, joints: Array) -> JointPath:
+        """Return corners (M, n) from the start to a goal as a path."""
+        goal = int(np.abs(self.goals - joints[-1]).max(axis=1).argmin())
+        return JointPath(joints, goal, path_length(joints, self.scale))
 
 
 class _Tree:
@@ -89,14 +87,11 @@ class _Tree:
         return self.nodes[indices]
 
 
-def connect(
-    search: TreeSearch, start: Array, goals: Array, *, random: np.random.Generator, most_samples: int
-) -> Array | None:
+def connect(search: TreeSearch, *, random: np.random.Generator, most_samples: int) -> Array | None:
     """Return a path of proven collision-free straight motions from the start to a goal; None if none is found.
 
     Args:
-        search: Proofs of clearance, sampled range and metric.
-        start: Start configuration, (n,). goals: Goal configurations, (K, n).
+        search: Start, goals, proofs of clearance, sampled range and metric.
         random: Source of the samples.
         most_samples: Number of random configurations after which the search ends.
 
@@ -107,14 +102,14 @@ def connect(
         TimeLimitReached: The time limit has passed.
     """
     lower, upper = search.lower, search.upper
-    step = TREES.longest * float(np.linalg.norm((upper - lower) * search.scale))
-    trees = _Tree(start[None]), _Tree(goals)
+    step = LONGEST_EDGE_SHARE * float(np.linalg.norm((upper - lower) * search.scale))
+    trees = _Tree(search.start[None]), _Tree(search.goals)
     growing, tried = 0, 0
     while tried < most_samples:
         check_time()
-        tried += TREES.batch
+        tried += TREE_BATCH
         tree, other = trees[growing], trees[1 - growing]
-        samples = lower + (upper - lower) * random.random((TREES.batch, len(lower)))
+        samples = lower + (upper - lower) * random.random((TREE_BATCH, len(lower)))
         parents = tree.nearest(samples, search.scale)
         nodes = _step_towards(tree.nodes[parents], samples, step, search.scale)
         clear = search.motions.are_clear(tree.nodes[parents], nodes)
@@ -188,21 +183,14 @@ class JointPath:
 
 
 def find_paths(
-    search: TreeSearch,
-    start: Array,
-    goals: Array,
-    *,
-    limits: tuple[Array, Array],
-    seed: int,
-    settings: PathSearchSettings = PathSearchSettings(),
+    search: TreeSearch, *, limits: tuple[Array, Array], seed: int, settings: PathSearchSettings = PathSearchSettings()
 ) -> list[JointPath]:
     """Return collision-free joint paths from a start to goals, sorted by length; empty if none was found.
 
     If the straight motion to the nearest goal is clear, no path is shorter, and only straight motions are returned.
 
     Args:
-        search: Proofs of clearance, sampled range and metric.
-        start: Start configuration, (n,). goals: Goal configurations, (K, n). Both keep the clearance.
+        search: Start, goals, proofs of clearance, sampled range and metric.
         limits: Lower and upper limits of the joints. Shape (n,) each.
         seed: Seed of the random searches.
         settings: Settings.
@@ -212,28 +200,26 @@ def find_paths(
     """
     motions, paths = search.motions, list[JointPath]()
     try:
-        for path in search_paths(search, start, goals, seed=seed, settings=settings):
+        for path in search_paths(search, seed=seed, settings=settings):
             paths = _with_path(search, paths, path)
         for path in paths[: settings.most_paths]:
             joints = optimise_length(motions, path.joints, search.scale, limits=limits)
-            paths = _with_path(search, [p for p in paths if p is not path], _path_of(search, joints, goals))
+            paths = _with_path(search, [p for p in paths if p is not path], search.path(joints))
     except TimeLimitReached:
         if not paths:
             raise
     return paths[: settings.most_paths]
 
 
-def search_paths(
-    search: TreeSearch, start: Array, goals: Array, *, seed: int, settings: PathSearchSettings
-) -> Iterator[JointPath]:
+def search_paths(search: TreeSearch, *, seed: int, settings: PathSearchSettings) -> Iterator[JointPath]:
     """Yield collision-free paths, shortened but not optimised, as they are found; see `find_paths`.
 
     Raises:
         TimeLimitReached: The time limit has passed.
     """
-    motions = search.motions
+    motions, start, goals = search.motions, search.start, search.goals
     clear = motions.are_clear(np.broadcast_to(start, goals.shape), goals)
-    paths = [_path_of(search, np.array([start, goal]), goals) for goal in goals]
+    paths = [search.path(np.array([start, goal])) for goal in goals]
     straight = sorted((paths[k] for k in np.flatnonzero(clear)), key=lambda path: path.length)
     yield from straight[: settings.most_paths]
     if straight and straight[0].length <= min(path.length for path in paths):
@@ -241,18 +227,13 @@ def search_paths(
     number, last, samples, has_path = 0, settings.attempts, settings.first, bool(straight)
     while number < last:
         random = np.random.default_rng([seed, number])
-        joints = connect(search, start, goals, random=random, most_samples=samples)
+        joints = connect(search, random=random, most_samples=samples)
         number += 1
         if joints is not None:
             has_path, last = True, min(last, number + settings.classes)
-            yield _path_of(search, shorten(motions, joints, search.scale, random=random), goals)
+            yield search.path(shorten(motions, joints, search.scale, random=random))
         if not has_path and number % 2 == 0:
             samples *= 2
-
-
-def _path_of(search: TreeSearch, joints: Array, goals: Array) -> JointPath:
-    goal = int(np.abs(goals - joints[-1]).max(axis=1).argmin())
-    return JointPath(joints, goal, path_length(joints, search.scale))
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:

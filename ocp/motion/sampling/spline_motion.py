@@ -121,31 +121,21 @@ class MotionLimits:
     end_velocity: Array
 
 
-@dataclass(frozen=True, eq=False)
-class SplineCost:
-    """Cost of a motion: weighted duration plus integrals of weighted squares of derivatives of the joint positions.
+def has_spline_cost(cost: Cost) -> bool:
+    """Return whether a cost weights only the duration and squares of derivatives of the joint positions."""
+    return set(cost.terms) <= {"time", "velocity", "acceleration", "jerk"}
 
-    Attributes:
-        time: Weight of the duration.
-        squares: Weights of the squared velocities, accelerations and jerks. Shape (3, n).
-    """
 
-    time: float
-    squares: Array
-
-    @classmethod
-    def of(cls, cost: Cost, size: int) -> SplineCost | None:
-        """Convert a cost to a SplineCost for `size` joints; None if it has other terms than time and squares."""
-        if not set(cost.terms) <= {"time", "velocity", "acceleration", "jerk"}:
-            return None
-        rows = cost.joint_weights(size) / 2, cost.acceleration, cost.jerk
-        return cls(cost.time, np.array([np.broadcast_to(np.asarray(row, dtype=float), size) for row in rows]))
+def square_weights(cost: Cost, size: int) -> Array:
+    """Return the weights of the squared velocities, accelerations and jerks of `size` joints. Shape (3, n)."""
+    rows = cost.joint_weights(size) / 2, cost.acceleration, cost.jerk
+    return np.array([np.broadcast_to(np.asarray(row, dtype=float), size) for row in rows])
 
 
 def optimal_motion_near(
     limits: MotionLimits,
     path: Array,
-    cost: SplineCost,
+    cost: Cost,
     horizon: float | None = None,
     *,
     settings: SplineMotionSettings = SplineMotionSettings(),
@@ -158,7 +148,7 @@ def optimal_motion_near(
     Args:
         limits: Limits, clearance and rates at the ends.
         path: Configurations with straight motions between them. Shape (M, n).
-        cost: The cost, which must weight time if the horizon is free.
+        cost: The cost, see `has_spline_cost`. It must weight time if the horizon is free.
         horizon: Duration, s; None if it is free.
         settings: Settings.
 
@@ -265,12 +255,13 @@ class _Search:
     """Search for the optimal motion in a spline basis by sequential linear or quadratic programming."""
 
     def __init__(
-        self, limits: MotionLimits, path: Array, cost: SplineCost, horizon: float | None, settings: SplineMotionSettings
+        self, limits: MotionLimits, path: Array, cost: Cost, horizon: float | None, settings: SplineMotionSettings
     ) -> None:
         self.limits, self.cost, self.horizon, self.settings = limits, cost, horizon, settings
         bounds = limits.bounds
         self.start, self.end, self.size = path[0], path[-1], path.shape[1]
-        self.degree = 3 if np.isfinite(bounds.jerk).any() or cost.squares[2].any() else 2
+        self.squares = square_weights(cost, self.size)
+        self.degree = 3 if np.isfinite(bounds.jerk).any() or cost.jerk else 2
         self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
         self.has_rate_limit = np.isfinite(bounds.velocity)
         self.spread = np.where(self.has_rate_limit, 0.0, np.ptp(path, axis=0).max())
@@ -292,7 +283,7 @@ class _Search:
         second = scipy.sparse.vstack([self.derivatives[2]] * len(sides)) if both else self._values(at, 2)
         self.at_torques = self._values(at, 0), self._values(at, 1), second
         self._fix_ends()
-        self.residuals = [self._residuals(order) for order in (1, 2, 3) if cost.squares[order - 1].any()]
+        self.residuals = [self._residuals(order) for order in (1, 2, 3) if self.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
         """Return p and matrix L of the cost |L c|^2 / T^p of a squared derivative; c: control points, T: duration."""
@@ -300,7 +291,7 @@ class _Search:
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
         basis = scipy.sparse.diags_array(np.sqrt((width * weights / 2).ravel())) @ self._values(at, order)
-        joints = scipy.sparse.diags_array(np.sqrt(self.cost.squares[order - 1]))
+        joints = scipy.sparse.diags_array(np.sqrt(self.squares[order - 1]))
         return 2 * order - 1, scipy.sparse.kron(basis, joints, format="csr")
 
     def _breaks(self, path: Array) -> Array:

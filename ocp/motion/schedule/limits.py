@@ -331,7 +331,7 @@ def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Ar
 
 
 def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
-    """Raise ProblemError if joint or tool jerks are limited and the path's curvature jumps, where they are infinite."""
+    """Raise ProblemError if joint or tool jerks are limited, but jumps of the path's curvature make them infinite."""
     joints_limited = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
     tool_limited = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
     jumps = path.curvature_jumps() if joints_limited or tool_limited else np.zeros(0)

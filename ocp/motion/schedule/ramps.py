@@ -196,7 +196,7 @@ def _join_motions(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProf
 
 
 def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Lower the speed at one end of a part of a path to what can be reached from the speed at the other end."""
+    """Lower the speed at one end of a part of a path to the highest that the speed at the other end permits."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 

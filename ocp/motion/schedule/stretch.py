@@ -186,7 +186,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 class _Samples:
-    """Limits at places of a path that has no jerk limits, to which more places are added.
+    """Limits at an extensible set of places on a path without jerk limits.
 
     Attributes:
         speed: Largest coefficient of the speed in a limit. Shape (P,), s/m.

@@ -208,7 +208,7 @@ class EnforcedRows:
         self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Add limits as constraints at the point of an interval where each is nearest; return which were there already.
+        """Enforce limits at the point of an interval where each is nearest; return which were enforced there before.
 
         Masks of shape (2, N, K + L + P).
         """

@@ -140,7 +140,7 @@ class DeadEnd(SolveError):
         self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
 
     def __reduce__(self) -> Any:
-        """Return what `pickle` needs to rebuild the error: its class, arguments and fields."""
+        """Return the data from which `pickle` rebuilds the error: its class, arguments and fields."""
         return type(self), (*self.args, self.until, self.obstructions, self.relaxations), self.__dict__
 
 

@@ -54,7 +54,7 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def pool(self, values: Array) -> Array:
-        """Return sums (g, ..., P) of values (n, ..., P) over the joints whose largest displacement counts."""
+        """Sum values (n, ..., P) over the joints of each term of the norm: one joint, or all for a maximum norm."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
         """Return lower bounds (P,) of step costs plus later costs, multipliers (P, n), and step ends (P, r).
@@ -137,10 +137,10 @@ class PathLength(Homogeneous):
     """Cost of a step: the weighted sum of the absolute joint displacements."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return what `Homogeneous.minimize` returns; on curves, the minimum is exact.
+        """Return the values of `Homogeneous.minimize`; on curves, the bounds are the exact minima.
 
-        It lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises by
-        2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
+        A minimum lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises
+        by 2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
         """
         if target.low.shape[1] != 1:
             return super().minimize(delta, target, after)
@@ -236,7 +236,7 @@ class HomogeneousBounds:
 
 
 def _longest_step(values: list[Array], changes: list[Array]) -> Array:
-    """Return how far, at most 1, positive values may move along changes and stay positive, for each of P programs."""
+    """Return the largest fraction, at most 1, of changes that keeps all values positive, for each of P programs."""
     shares = np.zeros(values[0].shape[1])
     for value, change in zip(values, changes, strict=True):
         np.maximum(shares, (-change / value).max(axis=0), out=shares)

@@ -64,7 +64,7 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Cover all time samples by as few segments as possible at minimum cost; return them and a lower bound of the cost.
+    """Cover all time samples by the fewest segments, at minimum cost; return the segments and a lower cost bound.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a

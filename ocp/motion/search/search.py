@@ -383,7 +383,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
-        """Return the bound up to which charts can be halved within memory; -inf if they are too small or too many."""
+        """Return the path cost up to which charts are halved, as memory permits; -inf if splitting must end."""
         costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
         if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
             return -np.inf
@@ -416,7 +416,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Return the shortened path along the least cost-to-go bound; None if it breaks off or makes too long steps."""
+        """Shorten the path along the least cost-to-go bound; return None if it breaks off or has too long steps."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 

@@ -67,7 +67,7 @@ class PathPoses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PathProblem:
-    """What a path through configurations at time samples must satisfy, and what it costs.
+    """Constraints and cost of a path through configurations at time samples.
 
     Attributes:
         samples: Manifolds of the samples.
@@ -132,7 +132,7 @@ class PathProblem:
 
     @property
     def dimension(self) -> int | None:
-        """Dimension of the manifolds; None if they differ in it."""
+        """Dimension of the manifolds; None if their dimensions differ."""
         sizes = {sample.manifolds.size for sample in self.samples}
         return sizes.pop() if len(sizes) == 1 else None
 
@@ -374,7 +374,7 @@ class _LocalProgram:
         return _Rows(self._steps(k[chosen], joint[chosen], factor[chosen]), value[chosen]), groups[chosen]
 
     def _limit_rows(self) -> _Rows:
-        """Return the excesses over joint limits, step limits and clearance that are within reach; at most 0 each."""
+        """Return constraints <= 0 for joint limits, step limits and clearances that a displacement may violate."""
         problem, path, n = self._problem, self._path, self._path.shape[1]
         gradients, values, reach = list[Any](), list[Array](), self._size[1:] + self._size[:-1]
         for sign, limit in ((1.0, problem.upper), (-1.0, -problem.lower)):
@@ -465,9 +465,9 @@ def optimise_path(path: Array, problem: PathProblem, settings: ProgramSettings =
 
 
 def optimality_of(path: Array, problem: PathProblem, settings: ProgramSettings = PROGRAM) -> tuple[float, bool]:
-    """Return how much cost a path (K, n) loses, and whether its cost may decrease to second order.
+    """Return the cost that small displacements of a path (K, n) save, and whether they may save more to second order.
 
-    The lost cost is what displacements of at most `settings.checked` would save to first order.
+    The displacements are at most `settings.checked`, and the saved cost is that to first order.
     """
     if not problem.dimension or len(path) < 2:
         return 0.0, False

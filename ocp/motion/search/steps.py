@@ -136,7 +136,7 @@ class StepCost(ABC):
     def quick_bounds(
         self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
     ) -> Array:
-        """Return constant lower bounds (P,) of `lower_bounds` over the source box that take little time.
+        """Return constant lower bounds (P,) of `lower_bounds` over the source box that are quick to compute.
 
         The displacements of the joints differ from `delta` by at most `spans` (P, n).
         """

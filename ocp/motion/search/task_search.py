@@ -214,7 +214,7 @@ class TaskSearch:
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return the classes of motions without a path that may cost less than `cost`: bound, time, configuration."""
+        """Return bound, time and configuration of the classes of motions without a path whose bound is below `cost`."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
@@ -307,7 +307,7 @@ def choose_samples(
 def lower_bound_along(
     problem: PathProblem, path: Array, loss: float, *, seeds: Callable[[int], Array], settings: SearchSettings
 ) -> float:
-    """Return a lower bound of the cost of all paths, from the samples between which a good path hardly reverses.
+    """Return a lower bound of the cost of all paths, from few samples chosen along a path of low cost.
 
     The bound is what the time limit and the largest number of charts allow. It is 0, with a warning, if even large
     charts are too many.

@@ -182,7 +182,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the number of each task equation in messages: its twist component 0..5; with several tasks its index."""
+    """Return numbers of the task equations for messages: the twist components 0..5 of one task, indices for several."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -217,7 +217,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target of a task (of a velocity: its integral) does not return to its start."""
+    """Raise ProblemError if a task's target pose, or its target velocity's integral, does not return to its start."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in equations.by_task(values):
         task = part.task
@@ -241,7 +241,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion at a given time at which the joints must rest; None is no time."""
+    """Raise ProblemError if a task prescribes motion at one of the times (s, or None) at which the joints must rest."""
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = (
@@ -252,7 +252,7 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
 
 
 def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
-    """Return whether all tasks prescribe rest at a time, s; without tasks (None), there is no motion."""
+    """Return whether all tasks prescribe rest at a time, s; True if there are no tasks (None)."""
     return equations is None or not any(_moving_tasks(equations, time))
 
 
@@ -284,7 +284,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than rate limits (n,) permit the tip of a fixed arm to move anywhere.
+    """Raise ProblemError if a task is faster than a fixed arm's tip can move anywhere within rate limits (n,).
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
     """
@@ -362,7 +362,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for as many joints as tasks fix there.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for joints that tasks bring to rest.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
     joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task

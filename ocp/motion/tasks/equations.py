@@ -59,7 +59,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints, (n,), that move no frame or reference of a task; none if they move a base or balance."""
+        """Mask of joints (n,) that move no task's frame or reference; all False for a moving or unfixed base."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
@@ -68,7 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text, with given time units of pose and of velocity tasks."""
+        """Return the units of the task equations as text, with the given suffixes for pose and velocity tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []
@@ -88,7 +88,7 @@ class TaskEquations:
 
             def expression_of(name: str, *shapes: tuple[int, int], rate: bool = False, task: TipTask = task) -> Any:
                 track, words = getattr(task, name), f"{name} rate" if rate else name
-                return track_expression(track.rate if rate else track, time, shapes, what=words, begin=task.begin)
+                return track_expression(track.rate if rate else track, time, shapes, label=words, begin=task.begin)
 
             if task.velocity is not None:
                 parts.append(pace * expression_of("velocity", (task.size, 1)))
@@ -155,7 +155,7 @@ class TaskEquations:
         )
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
-        """Return the deviations of the tips from their tasks by name, each as arguments of `Problem.watch`.
+        """Return by name the deviations of the tips from their tasks, each as arguments of `Problem.watch`.
 
         For poses these are their errors, for velocities the integral of their residual; each is judged relative to the
         path of the tips. A pose may deviate by the start gap of its task, which the feedback closes, and by its
@@ -232,7 +232,7 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors, m and chords of the unit circle, not zero at a rotation error of half a turn.
+        """Return pose errors, m and chords of the unit circle, that do not vanish at half a turn. Shape (_, 1).
 
         If all rotation is prescribed, the chords (2 sin(angle / 2), near zero the angle in rad) are the differences of
         the frame axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries.
@@ -295,7 +295,7 @@ class TaskEquations:
 
     @on_scalars
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the pose errors (rows, 1) of the tips of velocity tasks from those in a reference configuration."""
+        """Return the pose errors (rows, 1) of velocity tasks' tips relative to a reference configuration."""
         rows: list[Any] = [ca.DM(0, 1)]
         for part in (part for part in self.bound if not part.task.is_pose):
             position, rotation = (ca.DM(value) for value in part.pose_in_reference(at_base, at_joints))

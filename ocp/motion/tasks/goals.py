@@ -33,7 +33,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a start, joint positions or None as (Start, joint positions (n,) or None if free, base configuration).
+        """Convert a start, joints or None to (Start, joint positions (n,) or None if free, base configuration).
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -45,7 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a start or joint positions as (Start, joint positions (n,), base configuration); none may be free.
+        """Convert a start or joints to (Start, joint positions (n,), base configuration); no joint may be free.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.
@@ -227,7 +227,7 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the checked weights (size,) of the squared joint velocities: `velocity` times those of the joints."""
+        """Return the checked weights (size,) of the squared joint velocities: `velocity` times `weights`."""
         return self.velocity * checked_weights(self.weights, size)
 
     def __repr__(self) -> str:

@@ -122,8 +122,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges that a zero moment point rule turns into constraints: inward normals n (k, 2) and
-    offsets o (k,), n . point >= o; a margin moves them inwards.
+    """Return the support edges, moved inwards by a margin, that a zero moment point rule turns into constraints: inward
+    normals n (k, 2) and offsets o (k,), n . point >= o.
     """
     normals = machine.support.normals
     offsets = (normals * machine.support.vertices).sum(axis=1)
@@ -140,8 +140,8 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances of a zero moment point (2, 1) from the support edges, where motions (with `external`
-    wrenches, any) change them, (k, 1), m; raise ProblemError if it is beyond an edge in every motion.
+    """Return the distances (k, 1), m, of a zero moment point (2, 1) from the support edges, without constant ones;
+    raise ProblemError if a constant one is negative. `external` states whether wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
     movable = np.abs(normals @ machine.moving_directions.T).max(axis=1, initial=0.0) > PARALLEL
@@ -160,8 +160,8 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return along which axes (0: x, 1: y) motions move the zero moment point out of a rule's rectangle; raise
-    ProblemError if a coordinate that no motion moves is outside it.
+    """Return the coordinates (0: x, 1: y) of the zero moment point that a rule's rectangle must bound because they
+    vary; raise ProblemError if a constant coordinate is outside it.
     """
     rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
     low, high = zmp.region(machine)

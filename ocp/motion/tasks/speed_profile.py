@@ -43,7 +43,7 @@ def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple
 
 
 def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
-    """Return the index of the interval of increasing bounds (K + 1,) that contains each place, or that is nearest."""
+    """Return the index of the interval between increasing bounds (K + 1,) that contains or is nearest to each place."""
     return np.asarray(np.clip(np.searchsorted(bounds, places, side=side) - 1, 0, len(np.asarray(bounds)) - 2))
 
 
@@ -80,7 +80,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, that after the jump."""
+        """Return the motion at times (M,) in [0, duration], s; at a jump of the jerk, with the jerk after it."""
         words = f"s is outside the schedule, 0 to {self.duration:g} s"
         t = np.atleast_1d(values_within(time, self.duration, "time", words))
         segment = segment_index(self.t, t)
@@ -91,7 +91,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; where the motion rests, that on arrival."""
+        """Return the motion at distances (M,) from the start, m; where the motion stops, its values on arrival."""
         length = float(self.distance[-1])
         words = f"m is off the path, which is {length:g} m long"
         s = np.atleast_1d(values_within(distance, length, "distance", words))
@@ -108,7 +108,7 @@ class SpeedProfile:
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return a CasADi Function from time (s), clipped, to distance, speed, acceleration and jerk."""
+        """Return a CasADi Function from time (s), clipped to the motion, to distance, speed, acceleration and jerk."""
         time = ca.MX.sym("time")
         inside = ca.fmin(ca.fmax(time, 0.0), self.duration)
         table = np.stack([self.t[:-1], self.distance[:-1], self.speed[:-1], self.acceleration[:-1], self.jerk])
@@ -223,7 +223,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) reached over a distance (m); it is the inverse of ramp_distance."""
+    """Return the greatest speed (m/s) reached from `speed` over a distance (m), the inverse of `ramp_distance`."""
     # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
     # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
@@ -252,7 +252,7 @@ def ramp_phases(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def rest_profile(length: float, speed: float, acceleration: float, jerk: float) -> SpeedProfile:
-    """Return the fastest motion from rest to rest over a length (m), at the largest reachable speed if it is short."""
+    """Return the fastest motion from rest to rest over a length (m); its peak is at most `speed`."""
     for name, value in (("length", length), ("speed", speed), ("acceleration", acceleration), ("jerk", jerk)):
         require.positive(name, value)
     peak = min(speed, reachable_speed(0.0, length / 2, acceleration, jerk))

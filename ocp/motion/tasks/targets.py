@@ -50,7 +50,7 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target poses of all pose tasks in world along a motion, since some are relative to a link.
+    """Return the target poses of all pose tasks along a motion, in world, also of tasks relative to a link.
 
     Args:
         times: Times on the clock of the tasks, s. Shape (M,).
@@ -84,7 +84,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return those of the breaks (k,) of targets that a mesh needs as nodes to represent them, both ends included.
+    """Return the breaks (k,) of targets, including both ends, that a mesh needs as nodes to represent the targets.
 
     Intervals are bisected at the break nearest to their middle until the interpolants of the targets deviate by no more
     than `NODES` allows. A path of many short segments thus needs no more nodes than a smooth path of the same shape.
@@ -116,7 +116,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return times (k,) and additional ones, so that target poses are nearly linear in time between neighbours."""
+    """Return times (k,) with times added so that target poses are nearly linear in time between neighbours."""
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
     poses, _ = _target_rows(equations)
@@ -133,7 +133,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of the pose values among the targets of tasks, and the rows of the velocity of each pose."""
+    """Return the indices of the pose values in the column of targets, and the rows of the velocity of each pose."""
     poses, rates, at = list[int](), list[slice](), 0
     for part in equations.bound:
         for pose, rate in part.target_rows.values():

@@ -269,7 +269,7 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world).
+    """A task, the machine whose tip is the task's frame, and one whose tip is the reference frame (None: world).
 
     The methods return expressions of the machine's base configuration and joint positions.
     """
@@ -285,8 +285,8 @@ class BoundTask(NamedTuple):
 
     @property
     def target_rows(self) -> dict[str, tuple[slice, slice]]:
-        """Rows of each target of a pose in the column of targets, and of its velocity (3 rows), by name: "position" (3
-        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), as far as given.
+        """Rows of a pose's targets in the column of targets, and of their velocities (3 rows), by name: "position" (3
+        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), if prescribed.
         """
         rows, at = dict[str, tuple[slice, slice]](), 0
         for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
@@ -319,8 +319,8 @@ class BoundTask(NamedTuple):
         return self.reference.tip_pose(base, joints)
 
     def relative(self, base: Any, joints: Any, twist_of: Callable[[Any], Any]) -> Any:
-        """Return columns of twists of the tip relative to the reference, in world axes; `twist_of` gives those of the
-        tip of a machine. Shape (6, k).
+        """Return twists (6, k) of the tip relative to the reference, in world axes; `twist_of` gives the twists of a
+        machine's tip.
         """
         twist = twist_of(self.tip)
         if self.reference is None:
@@ -334,7 +334,7 @@ class BoundTask(NamedTuple):
         return self.relative(base, joints, lambda machine: machine.tip_twist(base, joints, rates))
 
     def rows(self, base: Any, joints: Any, twist: Any) -> Any:
-        """Return the components that the task prescribes of columns of twists (6, k) in world axes. Shape (size, k)."""
+        """Return those components of twists (6, k) in world axes that the task prescribes. Shape (size, k)."""
         task = self.task
         angular, linear = twist[0:3, :], twist[3:6, :]
         rotation = None
@@ -448,7 +448,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return the linear combinations (count, k) of the first rows of a matrix that its other rows span too."""
+    """Return the combinations (count, k) of the first `count` rows of a matrix that its other rows also span."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

@@ -102,7 +102,7 @@ class PathTracks(NamedTuple):
     breaks: Array  # times at which segments of the path or of the speed profile meet, both ends included, (k,), s
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
-        """Return the direction (3,) of an axis of the tool frame as a function of time with a rate."""
+        """Return the direction (3,) of an axis of the tool frame as a function of time with its derivative."""
         rotation, angular_velocity = self.orientation, self.orientation.rate  # type: ignore[attr-defined]
 
         def direction(time: Any) -> Any:
@@ -128,7 +128,7 @@ def checked_speed(speed: Any) -> float:
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return the functions of time of a tool that moves along a path; in builders they need symbols=casadi.MX.
+    """Return functions of time for a tool that moves along a path; builders that use them need symbols=casadi.MX.
 
     The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
@@ -209,18 +209,17 @@ def track_expression(
     time: Any,
     shapes: tuple[int, int] | tuple[tuple[int, int], ...],
     *,
-    what: str = "track",
+    label: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a target, a constant or a function of CasADi time since its begin, as a dense expression of the symbol
-    `time`.
+    """Return a target, a constant or a function of the time since its begin, as a dense expression of `time`.
 
     Raises:
         ProblemError: Another shape than those allowed, a value that is not finite, or an expression of anything but the
             time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
-    value = _call_track(track, time - begin if begin else time, what) if callable(track) else track
+    value = _call_track(track, time - begin if begin else time, label) if callable(track) else track
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value.ravel())
     if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
@@ -230,27 +229,27 @@ def track_expression(
         try:
             value = ca.DM(floats(value))
         except NOT_NUMBERS as error:
-            words = f"{what} gives {value!r}, not numbers or expressions of shape {expected}"
-            raise ProblemError(words, name=what, value=value, limit=allowed) from error
+            words = f"{label} gives {value!r}, not numbers or expressions of shape {expected}"
+            raise ProblemError(words, name=label, value=value, limit=allowed) from error
     if value.shape not in allowed:
-        hint = ": one entry for each row of the task" if what == "velocity" else ""
-        words = f"{what} has shape {tuple(value.shape)}, expected {expected}{hint}"
-        raise ProblemError(words, name=what, value=value.shape, limit=allowed)
+        hint = ": one entry for each row of the task" if label == "velocity" else ""
+        words = f"{label} has shape {tuple(value.shape)}, expected {expected}{hint}"
+        raise ProblemError(words, name=label, value=value.shape, limit=allowed)
     if isinstance(value, ca.DM):
         if not np.isfinite(np.array(value)).all():
             numbers = np.array(value).ravel()
-            raise ProblemError(f"{what} {numbers.tolist()} is not finite", name=what, value=numbers)
+            raise ProblemError(f"{label} {numbers.tolist()} is not finite", name=label, value=numbers)
     elif others := [str(symbol) for symbol in ca.symvar(value) if not ca.is_equal(symbol, time, 1)]:
-        words = f"{what} depends on {others}, but only the time it is called with may occur"
-        raise ProblemError(words, name=what, value=others)
+        words = f"{label} depends on {others}, but only the time it is called with may occur"
+        raise ProblemError(words, name=label, value=others)
     return ca.densify(value)
 
 
-def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
+def _call_track(track: Callable[[Any], Any], time: Any, label: str) -> Any:
     """Evaluate a target function; raise ProblemError if it fails, but pass on errors that SX symbols cause."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):
         raise
     except Exception as error:  # raised by the function itself
-        raise ProblemError(f"{what}: the function fails: {error!r}", name=what, value=track) from error
+        raise ProblemError(f"{label}: the function fails: {error!r}", name=label, value=track) from error

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Robot, Sphere, inverse_dynamics
+from models import FixedBase, FreeFloating, Robot, Sphere, inverse_dynamics
 from ocp import Plan
 from ocp.app import Check, Fault, check_trajectory
 from ocp.app.files import read_trajectory, read_waypoints
@@ -349,3 +349,24 @@ def test_plans_of_the_gallery_are_not_accused(name: str, tmp_path: Path) -> None
     check = check_trajectory(plan.machine, read_trajectory(file, joints=robot.joint_names))
     assert check.passed, check
     assert check.faults == ()
+
+
+@pytest.mark.parametrize("base", [FixedBase, FreeFloating])
+def test_the_zero_of_the_clock_does_not_matter(tmp_path: Path, base: Any) -> None:
+    t = np.linspace(0.0, 4.0, 41)
+    q = MIDDLE + np.outer((t / 4) ** 5, SWING)  # each worst value occurs once
+    q[:, 1] = 3.09 * (t / 4) ** 5  # the arm collides with itself
+    machine = base(Robot.from_urdf(URDF, tip="finger"))
+    here, later = (
+        check_motion(machine, read_trajectory(write_table(tmp_path / "motion.csv", t + begin, q)), velocity=0.5)
+        for begin in (0.0, 50.0)
+    )
+    assert {fault.kind for fault in here.faults} >= {"clearance", "velocity"}
+    pairs: list[tuple[Any, Any]] = [(here.rows, later.rows), (here.faults, later.faults)]
+    for first, second in pairs:
+        assert [each.name for each in first] == [each.name for each in second]
+        for old, new in zip(first, second, strict=True):
+            assert (old.time is None) == (new.time is None)
+            if old.time is not None and abs(old.value) > 1e-9:
+                assert new.time == pytest.approx(old.time + 50.0, abs=1e-6)
+            assert new.value == pytest.approx(old.value, rel=1e-6, abs=1e-9)

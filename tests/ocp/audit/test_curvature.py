@@ -18,7 +18,6 @@ from ocp.audit.costates import adjoint
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import balance, pseudo_inverses
-from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import random_program
 from tests.ocp.problems import Array
@@ -29,9 +28,7 @@ METHOD = Collocation(intervals=20, degree=3)
 def second_order(problem: Problem, solution: Solution) -> Curvature:
     """Of a plan for a problem that it need not have been made for."""
     form = Formulation(problem)
-    p = form.parameter_vector(solution.parameters)
-    bounds = form.bound_values(p)
-    along = Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
+    along = Linearisation(form, solution)
     return curvature(AccessoryProblem(along, adjoint(along, None, abs(solution.cost) or 1.0)))
 
 

@@ -13,7 +13,6 @@ from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import adjoint
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Fit, best_multipliers
-from ocp.audit.sizes import sizes
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.formulation import Formulation
 
@@ -54,10 +53,7 @@ def declared_problem(declare: str, unit: float = 1.0, second: float = 1.0) -> Pr
 def fitted(plan: Solution) -> Fit:
     problem = plan.problem
     assert problem is not None
-    form = Formulation(problem)
-    p = form.parameter_vector(plan.parameters)
-    bounds = form.bound_values(p)
-    along = Linearisation(form, plan, p, bounds, sizes=sizes(form, plan, p, bounds))
+    along = Linearisation(Formulation(problem), plan)
     known = adjoint(
         along, None if along.form.path.equality.all() and not along.nodal else perturb(along), abs(plan.cost)
     )

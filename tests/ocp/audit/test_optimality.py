@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, MultipleShooting, Problem, Solution, solve
+from ocp.audit.linearisation import Linearisation
 from ocp.audit.optimality import Optimality, optimality
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import double_integrator, energy
@@ -17,9 +18,7 @@ METHOD = Collocation(8)
 
 
 def optimality_of(solution: Solution) -> Optimality:
-    form = Formulation.of(solution.problem)
-    p = form.parameter_vector(solution.parameters)
-    return optimality(form, solution, p, form.bound_values(p))
+    return optimality(Linearisation(Formulation.of(solution.problem), solution))
 
 
 def swerved(size: float) -> tuple[Solution, float]:

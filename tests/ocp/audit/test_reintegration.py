@@ -15,7 +15,6 @@ from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.audit.correction import corrected_motion
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.reintegration import Reintegration, integrated_motion, reintegrate
-from ocp.audit.sizes import FineGrid, fine_grid, sizes
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import of, random_program
 from tests.ocp.problems import Array, van_der_pol
@@ -29,16 +28,8 @@ METHODS = {
 every_method = pytest.mark.parametrize("method", METHODS)
 
 
-def linearised(problem: Problem, solution: Solution) -> tuple[Linearisation, FineGrid]:
-    form = Formulation(problem)
-    p = form.parameter_vector(solution.parameters)
-    bounds = form.bound_values(p)
-    result = sizes(form, solution, p, bounds)
-    return Linearisation(form, solution, p, bounds, sizes=result), fine_grid(solution)
-
-
 def again(problem: Problem, solution: Solution) -> Reintegration:
-    return reintegrate(*linearised(problem, solution))
+    return reintegrate(Linearisation(Formulation(problem), solution))
 
 
 def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: Any = 0.0) -> tuple[Problem, Solution]:
@@ -68,7 +59,7 @@ def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: 
 def test_states_are_those_of_the_closed_form(rate: Any, exact: Callable[[Array], Array]) -> None:
     problem, plan = driven(rate, control=1.0)
     result = again(problem, plan)
-    np.testing.assert_allclose(result.states[:, 0], exact(result.t), atol=1e-9)
+    np.testing.assert_allclose(result.states[:, 0], exact(result.grid.t), atol=1e-9)
     assert result.breakdown_time is None
 
 
@@ -76,7 +67,7 @@ def test_a_motion_that_leaves_for_infinity_breaks_down_where_it_does() -> None:
     problem, plan = driven(lambda x, u, t: 1 + (2 * x) ** 2)  # x = tan(2 t) / 2
     result = again(problem, plan)
     assert result.breakdown_time == pytest.approx(np.pi / 4, abs=4e-3)
-    assert np.isfinite(result.states[result.t < np.pi / 4 - 4e-3]).all()
+    assert np.isfinite(result.states[result.grid.t < np.pi / 4 - 4e-3]).all()
     assert not plan.audit().feasible
 
 
@@ -85,8 +76,8 @@ def test_stiff_dynamics_follow_their_slow_motion(rate: float) -> None:
     """x' = r (sin t + u - x) from 0, with u = 1 held: x = 1 + sin t - cos t / r at times well beyond 1 / r."""
     problem, solution = driven(lambda x, u, t: rate * (ca.sin(t) + u - x), 3.0, control=1.0)
     motion = again(problem, solution)
-    late = motion.t > 0.1
-    exact = 1 + np.sin(motion.t) - np.cos(motion.t) / rate
+    late = motion.grid.t > 0.1
+    exact = 1 + np.sin(motion.grid.t) - np.cos(motion.grid.t) / rate
     np.testing.assert_allclose(motion.states[late, 0], exact[late], atol=1e-9)
     assert motion.cost == pytest.approx(3.0, rel=1e-9)
     assert motion.breakdown_time is None
@@ -102,7 +93,7 @@ def test_the_integration_is_as_exact_in_any_unit(unit: float, time: float) -> No
     problem.minimize(u**2)
     plan = random_program(problem, {"x": lambda t: unit * t / time}, {"u": 1.0}, {"x": 0.0}, time)
     result = again(problem, plan)
-    s = result.t / time
+    s = result.grid.t / time
     exact = 9 * (np.cos(9 * s) + 9 * np.sin(9 * s) - np.exp(-s)) / 82
     np.testing.assert_allclose(result.states[:, 0] / unit, exact, atol=1e-9)
 
@@ -117,8 +108,8 @@ def test_the_running_cost_is_integrated_along(method: str) -> None:
 
 @every_method
 def test_corrections_of_a_plan_lead_where_its_integration_does(method: str) -> None:
-    along, grid = linearised(van_der_pol(), solve(van_der_pol(), METHODS[method]))
-    near, exact = corrected_motion(along, grid), integrated_motion(along, grid)
+    along = Linearisation(Formulation(van_der_pol()), solve(van_der_pol(), METHODS[method]))
+    near, exact = corrected_motion(along), integrated_motion(along)
     assert near is not None
     for name in ("local", "states"):
         np.testing.assert_allclose(getattr(near, name), getattr(exact, name), rtol=0, atol=2e-10)
@@ -131,8 +122,8 @@ def test_a_wrong_plan_is_corrected_or_left_to_the_integration(share: float) -> N
     plan = solve(van_der_pol(), METHODS["radau"])
     curve = plan.control_interpolant
     wrong = replace(plan, control_interpolant=replace(curve, values=(1 + share) * curve.values))
-    along, grid = linearised(van_der_pol(), wrong)
-    exact, result = integrated_motion(along, grid), again(van_der_pol(), wrong)
+    along = Linearisation(Formulation(van_der_pol()), wrong)
+    exact, result = integrated_motion(along), again(van_der_pol(), wrong)
     np.testing.assert_allclose(result.states, exact.states.reshape(result.states.shape), rtol=0, atol=2e-10)
     np.testing.assert_allclose(result.local, exact.local.reshape(result.local.shape), rtol=0, atol=2e-10)
     assert result.cost == pytest.approx(exact.cost, rel=1e-9)
@@ -142,8 +133,8 @@ def test_jumps_of_the_plan_are_carried_on_by_its_dynamics() -> None:
     plan = solve(van_der_pol(), METHODS["legendre"])
     curve = plan.state_interpolant
     values = curve.values + 1e-4 * np.sin(np.arange(20))[:, None, None]
-    along, grid = linearised(van_der_pol(), replace(plan, state_interpolant=replace(curve, values=values)))
-    near, exact = corrected_motion(along, grid), integrated_motion(along, grid)
+    along = Linearisation(Formulation(van_der_pol()), replace(plan, state_interpolant=replace(curve, values=values)))
+    near, exact = corrected_motion(along), integrated_motion(along)
     assert near is not None
     np.testing.assert_allclose(near.states, exact.states, rtol=0, atol=2e-10)
     np.testing.assert_allclose(near.local, exact.local, rtol=0, atol=2e-10)
@@ -156,7 +147,7 @@ def test_oscillations_in_phase_with_the_grid_are_detected(half_cells: int) -> No
     rest = replace(plan, state_interpolant=replace(plan.state_interpolant, values=0 * plan.state_interpolant.values))
     result = again(problem, rest)
     swing = 2 * np.pi * 1200 / half_cells
-    np.testing.assert_allclose(result.states[:, 0], result.t - np.sin(swing * result.t) / swing, atol=1e-8)
+    np.testing.assert_allclose(result.states[:, 0], result.grid.t - np.sin(swing * result.grid.t) / swing, atol=1e-8)
 
 
 # ---- between the points ----------------------------------------------------------------------------------------------

@@ -5,22 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pytest
 
 from ocp import Collocation, Problem, refine, solve
 from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import clebsch, is_convex
-from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from tests.ocp.test_refinement import fishing
 
 
 def along(solution: Solution) -> Linearisation:
-    form = Formulation.of(solution.problem)
-    bounds = form.bound_values(np.zeros(0))
-    return Linearisation(form, solution, np.zeros(0), bounds, sizes=sizes(form, solution, np.zeros(0), bounds))
+    return Linearisation(Formulation.of(solution.problem), solution)
 
 
 def store() -> Problem:

@@ -21,7 +21,7 @@ from tests.ocp.problems import double_integrator
 def sizes_of(problem: Problem, solution: Solution) -> Sizes:
     form = Formulation(problem)
     p = form.parameter_vector(solution.parameters)
-    return sizes(form, solution, p, form.bound_values(p))
+    return sizes(form, fine_grid(solution, p), form.bound_values(p))
 
 
 def travel(
@@ -169,7 +169,7 @@ def test_infinite_values_do_not_affect_the_scale() -> None:
 def test_the_fine_grid_stands_on_both_sides_of_a_break() -> None:
     problem, _ = travel()
     solution = solve(problem, Collocation(5))
-    grid = fine_grid(solution)
+    grid = fine_grid(solution, np.zeros(0))
     assert len(grid.t) == 5 * grid.samples == 5 * 31
     np.testing.assert_allclose(grid.t.reshape(5, -1)[1:, 0], grid.t.reshape(5, -1)[:-1, -1])
     np.testing.assert_allclose(grid.states[:, 0], solution.at(np.minimum(grid.t, 1.0))["q"][:, 0], atol=1e-12)

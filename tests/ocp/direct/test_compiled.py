@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from ocp import Collocation, MultipleShooting, Problem, SolveError, prepare
 from ocp.console import TimeLimitReached, time_limited
 from ocp.direct import code_generation
 from ocp.direct.assembly import Derivatives, derivatives
-from ocp.direct.code_generation import CompilerError, Library, build_library
+from ocp.direct.code_generation import CompilerError, build_library, library_key
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
@@ -51,9 +51,9 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield place / "selfmotion"
 
 
-def number(value: int) -> Library:
-    """A library with a function that returns a number."""
-    return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
+def number(value: int) -> tuple[list[str], Callable[[], str]]:
+    """Contents and C code of a library with a function that returns a number."""
+    return [f"number {value}"], lambda: f"int number(void) {{ return {value}; }}"
 
 
 def call_count(library: Path) -> int:
@@ -174,9 +174,9 @@ import ctypes, sys, threading, time, types
 for face in ("models", "ocp"):  # what the faces show is not needed, and takes a second
     sys.modules[face] = types.ModuleType(face)
     sys.modules[face].__path__ = [face]
-from ocp.direct.code_generation import Library, build_library
+from ocp.direct.code_generation import build_library
 def number(value):
-    return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
+    return [f"number {value}"], lambda: f"int number(void) {{ return {value}; }}"
 """
 COUNTED = 'echo once >> "$(dirname "$0")/count"; exec cc "$@"'
 
@@ -193,7 +193,7 @@ def test_meshes_share_compiled_functions(own: Path, tmp_path: Path, monkeypatch:
 
 def test_processes_compile_once(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "slow", f"sleep 0.5; {COUNTED}"))
-    words = ALONE + "print(ctypes.CDLL(str(build_library(number(3)))).number())"
+    words = ALONE + "print(ctypes.CDLL(str(build_library(*number(3)))).number())"
     both = [subprocess.Popen([sys.executable, "-c", words], cwd=ROOT, stdout=subprocess.PIPE) for _ in range(2)]
     assert [process.communicate()[0] for process in both] == [b"3\n", b"3\n"]
     assert (tmp_path / "count").read_text().split() == ["once"]
@@ -201,15 +201,15 @@ def test_processes_compile_once(own: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_compilers_and_contents_are_distinguished(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    one, two = number(1), number(2)
-    keys = [library.key for library in (one, two)]
+    one, two = number(1)[0], number(2)[0]
+    keys = [library_key(contents) for contents in (one, two)]
     monkeypatch.setenv("CC", script(tmp_path / "another", COUNTED))
-    keys.append(one.key)
+    keys.append(library_key(one))
     newer = (tmp_path / "another").read_text().replace("ours 1", "ours 2")
     (tmp_path / "another").write_text(newer)
-    assert one.key == keys[-1]  # asked once a process for its version
+    assert library_key(one) == keys[-1]  # asked once a process for its version
     code_generation._version.cache_clear()
-    keys.append(one.key)
+    keys.append(library_key(one))
     assert len(set(keys)) == len(keys) == 4
 
 
@@ -218,12 +218,12 @@ def test_compilers_and_contents_are_distinguished(own: Path, tmp_path: Path, mon
 
 @pytest.mark.parametrize("damage", [b"", b"\x7fELF", None])
 def test_a_damaged_file_is_written_anew(own: Path, damage: bytes | None) -> None:
-    library = build_library(number(4))
+    library = build_library(*number(4))
     whole = library.read_bytes()
     library.unlink()  # Python has not loaded it
     library.write_bytes(whole[:-1] + b"x" if damage is None else damage)
-    assert cache.load_library(number(4).key) is None
-    assert call_count(build_library(number(4))) == 4
+    assert cache.load_library(library_key(number(4)[0])) is None
+    assert call_count(build_library(*number(4))) == 4
     assert [file.read_bytes() for file in own.iterdir()] == [whole]
 
 
@@ -238,16 +238,16 @@ def test_without_a_folder_it_is_compiled_for_the_process(tmp_path: Path, monkeyp
 
 
 def test_a_folder_that_may_only_be_read_serves(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    library = build_library(number(5))
+    library = build_library(*number(5))
 
     def refused(*_: Any, **__: Any) -> Any:
         raise PermissionError
 
     monkeypatch.setattr(os, "utime", refused)
     monkeypatch.setattr(cache, "NamedTemporaryFile", refused)
-    assert build_library(number(5)) == library
-    assert call_count(build_library(number(6))) == 6
-    assert build_library(number(6)) != library
+    assert build_library(*number(5)) == library
+    assert call_count(build_library(*number(6))) == 6
+    assert build_library(*number(6)) != library
 
 
 @pytest.mark.parametrize("words", ["false", "no-such-compiler", "'", " "])
@@ -287,7 +287,7 @@ def test_a_failing_compiler_is_reported_and_not_tried_again(
 ) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "failing", "echo no room on device >&2; exit 1"))
     with pytest.raises(CompilerError, match="no room on device"):
-        build_library(number(7))
+        build_library(*number(7))
     assert prepare(van_der_pol(), Collocation(4), compiled=True).solve().success
     assert "no room on device" in caplog.text
 
@@ -295,19 +295,19 @@ def test_a_failing_compiler_is_reported_and_not_tried_again(
 def test_undefined_functions_are_no_library() -> None:
     """A call of it would be the end of Python."""
     with pytest.raises(CompilerError, match="fails"):
-        build_library(Library(("undefined",), lambda: "int gone(void); int number(void) { return gone(); }"))
+        build_library(["undefined"], lambda: "int gone(void); int number(void) { return gone(); }")
 
 
 def test_long_functions_are_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(code_generation, "CODE_SIZES", code_generation.CodeSizes(accepted=10))
     with pytest.raises(CompilerError, match="characters"):
-        build_library(number(8))
+        build_library(*number(8))
 
 
 def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    key = number(9).key
+    key = library_key(number(9)[0])
     assert cache.load_library(key) is None
-    library = build_library(number(9))
+    library = build_library(*number(9))
     assert cache.load_library(key) == library
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     if library.stat().st_uid == 0:
@@ -316,15 +316,15 @@ def test_a_library_of_somebody_else_is_not_run(own: Path, monkeypatch: pytest.Mo
 
 
 def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [build_library(number(value)) for value in range(10, 13)]
+    files = [build_library(*number(value)) for value in range(10, 13)]
     for age, file in enumerate(files):
         os.utime(file, (0, 1000 + age))
-    assert build_library(number(10)) == files[0]  # used again
+    assert build_library(*number(10)) == files[0]  # used again
     monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 3 * files[0].stat().st_size)
-    newest = build_library(number(13))
+    newest = build_library(*number(13))
     assert {file for file in own.iterdir() if file.suffix == ".so"} == {files[0], files[2], newest}
     monkeypatch.setattr(cache, "MAX_LIBRARY_BYTES", 0)
-    assert build_library(number(14)).exists()  # what is needed now stays
+    assert build_library(*number(14)).exists()  # what is needed now stays
     assert len(list(own.glob("*.so"))) == 1
 
 
@@ -332,10 +332,10 @@ def test_libraries_that_are_used_least_make_room(own: Path, monkeypatch: pytest.
 
 
 def test_locks_are_removed_unless_somebody_has_them(own: Path) -> None:
-    build_library(number(21))
+    build_library(*number(21))
     (own / "left.lock").touch()
     with cache.exclusive("taken"):
-        build_library(number(22))
+        build_library(*number(22))
         assert {file.name for file in own.glob("*.lock")} == {"taken.lock"}
     assert not list(own.glob("*.lock"))
 
@@ -350,14 +350,14 @@ def test_a_time_limit_ends_the_wait_and_leaves_nothing(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     with time_limited(0.3), pytest.raises(TimeLimitReached):
-        build_library(number(17))
+        build_library(*number(17))
     assert is_gone(appears(tmp_path / "pid"))
     assert is_empty(tmp_path / "temporary")
     assert not list(own.iterdir())
 
 
 LEAVING = """
-threading.Thread(target=build_library, args=[number(18)], daemon=True).start()
+threading.Thread(target=build_library, args=number(18), daemon=True).start()
 print("under way", flush=True)
 time.sleep(float(sys.argv[1]))
 """
@@ -380,7 +380,7 @@ def test_a_process_that_ends_takes_its_compiler_along(
     process.communicate()
     assert is_gone(pid)
     assert is_empty(tmp_path / "temporary")
-    assert cache.load_library(number(18).key) is None
+    assert cache.load_library(library_key(number(18)[0])) is None
 
 
 PATIENCE = 300.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -465,3 +466,10 @@ def test_reported_times_and_interpolants_belong_together() -> None:
         places = solution.t / solution.horizon
         np.testing.assert_allclose(solution.state_interpolant(places), x, atol=1e-9)
         np.testing.assert_allclose(solution.costate_interpolant(places), lam, atol=1e-9)
+
+
+def test_the_told_durations_of_building_and_solving_are_parts_of_the_call() -> None:
+    began = time.monotonic()
+    seconds = solve(energy(), Indirect()).seconds
+    assert min(seconds.values()) > 0.0
+    assert sum(seconds.values()) <= time.monotonic() - began

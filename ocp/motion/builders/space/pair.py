@@ -205,7 +205,7 @@ def _pose_gap(place: Array, turn: Array, position: Array, rotation: Array) -> Ar
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return tip positions (M, 3) and rotations (M, 3, 3) on the way from rest to the grasp, for an initial guess."""
+    """Return tip positions (M, 3) and rotations (M, 3, 3) on a path from rest to the grasp, for an initial guess."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])

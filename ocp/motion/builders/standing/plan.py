@@ -99,7 +99,7 @@ def guess_in_time(
 def _extensible_problem(
     steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> Phases:
-    """Declare the problem of footsteps that may take longer than requested, at a price above all other costs."""
+    """Declare the problem of footsteps that may take longer than requested, at a cost above all others."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -194,8 +194,8 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
 class Attempt(NamedTuple):
-    """Result of one solve: plan or last iterate, why it is no plan, and whether this is only that inequalities are
-    exceeded between the points of the grid.
+    """Result of one solve: plan or last iterate, the error that rejects it, and whether the error reports only
+    violations of inequalities between the points of the grid.
     """
 
     solution: Solution | None
@@ -296,7 +296,7 @@ def _first_accepted(
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
     """Try formulations and meshes in turn, and return the first plan that the audit accepts; raise SolveError or
-    ProblemError if there is none, or if collisions are all that is wrong with a plan.
+    ProblemError if there is none, or if a plan fails only because of collisions.
     """
     reasons, refused = list[str](), list[ProblemError]()
     failure, last = SolveError(), None
@@ -366,7 +366,7 @@ def _audited(
     problem: Problem,
     run: Callable[[], Solution],
 ) -> Attempt:
-    """Run a solver and audit the plan; `pose_error` rejects plans that pass but leave their tasks."""
+    """Run a solver and audit the plan; `pose_error` rejects plans that pass but deviate from their tasks."""
     try:
         solution = run()
     except SolveError as error:

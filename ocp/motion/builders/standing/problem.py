@@ -257,7 +257,7 @@ def constrain_tips(
     moving: bool,
     level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the accelerations of their tasks, and to velocities at a `moving` start, or only to poses.
+    """Constrain the tips to the accelerations of their tasks and, if `moving`, start velocities, or to the poses alone.
 
     `motion` has base, joint positions, rates and accelerations.
     """

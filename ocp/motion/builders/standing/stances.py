@@ -229,7 +229,7 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: Mapping[str, Foothold] | None = None) -> TaskEquations:
-    """Return task equations that keep feet on footholds, by default all feet but the first, as far as joints can."""
+    """Return equations that keep feet, by default all but the first, on footholds in the directions of joint motion."""
     if footholds is None:
         footholds = {name: stance.footholds[name] for name in stance.other_feet}
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]

@@ -56,7 +56,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than there are."""
+    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than the machine has."""
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
     left = machine.joint_size - (size + pinned - along_parameter)
     follows = tip_level == "acceleration" and not pinned  # the joints come to rest with the tip

@@ -201,7 +201,7 @@ def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:
 
 
 def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, margin: float, limits: Limits) -> None:
-    """Constrain a foot's load to what its sole can bear; the load of a grip is not limited."""
+    """Constrain pressure, center of pressure and friction of the load on a foot; a grip has no limits."""
     if stance.feet[name].sole is None:
         return
     least = 0.0 if limits.vertical_force is None else float(limits.vertical_force)
@@ -254,12 +254,12 @@ def _over_support(stance: Stance, joints: Any) -> Any:
 
 
 def _at_random(rows: Any, joints: Any) -> Array:
-    """Return the values of rows at three random configurations and values of their other symbols. Shape (k, 3)."""
+    """Evaluate expressions at three random joint positions, with random values of all other symbols. Shape (k, 3)."""
     rng = np.random.default_rng(0)
     own = ca.vertsplit(joints)
-    others = [symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in own)]
-    function = ca.Function("rows", [joints, ca.vertcat(ca.DM(0, 1), *others)], [rows])
-    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(others))) for _ in range(3)]
+    free = [symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in own)]
+    function = ca.Function("rows", [joints, ca.vertcat(ca.DM(0, 1), *free)], [rows])
+    samples = [function(rng.normal(size=joints.numel()), rng.uniform(size=len(free))) for _ in range(3)]
     return np.column_stack([np.array(value).ravel() for value in samples])
 
 
@@ -320,7 +320,7 @@ class StepsMotion:
         return np.where(self.held(foot)[:, None], points, np.nan)
 
     def friction(self, foot: str) -> Array:
-        """Return the tangential over the normal force of a foot, which friction bears; nan in the air. Shape (M,)."""
+        """Return the ratio of the tangential to the normal force on a foot; nan in the air. Shape (M,)."""
         _, force = self._load_in_sole(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -10,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import simpson
+from scipy.integrate import cumulative_trapezoid, simpson
 
 from models import FreeFloating, Link, Robot, center_of_mass, with_wheels
 from models.machines.machine import with_tip
@@ -36,6 +37,7 @@ from ocp.motion.builders.space.pair import (
     require_reach,
     wheel_capacity,
 )
+from ocp.problem.phases import DURATION
 from tests.models.robot.trees import Array
 from tests.ocp.motion.builders.captures import (
     CONE,
@@ -432,3 +434,30 @@ def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
     request["target_base"] = [2.5, 0.2, 0.6, *attitude]
     plan = called(solve_capture, **request)
     assert_captured(request, plan)
+
+
+@pytest.mark.parametrize("request_of", [planar_capture, lambda: capture((0.02, -0.03, 0.05))], ids=["plane", "space"])
+def test_guesses_of_both_phases_conserve_the_momentum(request_of: Callable[[], dict[str, Any]]) -> None:
+    """The base of a guess moves as its joints make it move, up to the error of the steps in time."""
+    request = request_of()
+    tolerance = {"approach": 0.01, "detumble": 0.002}  # of steps of first and of second order
+    problem = called(capture_problem, **request)
+    carried = pair_momentum(
+        request["chaser"], request["target"], base=request["chaser"].base_home(),
+        target_base=request["target_base"], joints=request["start"],
+    )  # fmt: skip
+    pair = join_target(request["chaser"].robot, request["target"].robot)
+    chasers = {"approach": request["chaser"], "detumble": FreeFloating(pair, request["chaser"].base)}
+    chasers["detumble"] = replace(chasers["detumble"], conserved_momentum=np.array(ca.DM(carried)).ravel())
+    for name, machine in chasers.items():
+        states = problem.declared.states
+        share = np.linspace(0.0, 1.0, 400)
+        t = states[f"{name}.{DURATION}"].guess * share
+        base, joints, rates = (
+            np.asarray(states[f"{name}.{each}"].guess(share)) for each in ("base", "joints", "velocities")
+        )
+        b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
+        moves = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)]).map(len(t))
+        needed = np.array(moves(base.T, joints.T, rates.T)).T
+        gained = cumulative_trapezoid(needed, t, axis=0)
+        np.testing.assert_allclose(base[1:] - base[0], gained, atol=tolerance[name] * np.abs(gained).max())

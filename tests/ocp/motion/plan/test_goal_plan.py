@@ -148,8 +148,8 @@ def test_squared_rates_within_accelerations_are_planned_in_a_fixed_time(horizon:
     assert (np.abs(sample.accelerations) <= [3.003, 2.002]).all()
 
 
-@pytest.mark.parametrize("limits", [None, Limits(acceleration=1.0, torque=np.inf)])
-def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits | None) -> None:
+@pytest.mark.parametrize("limits", [Limits(), Limits(acceleration=1.0, torque=np.inf)])
+def test_a_goal_at_the_start_is_reached_by_rest(limits: Limits) -> None:
     plan = plan_to_goal(request_of(BOX, goals=START, limits=limits))
     assert plan.audit().feasible
     assert plan.cost == 0
@@ -178,7 +178,7 @@ def test_wherever_the_time_limit_passes_a_motion_is_returned_or_refused(
     """A clock that runs out at a certain check of the time: no other exception than SolveError leaves the planner."""
     clock = count()
     monkeypatch.setattr(console, "time_left", lambda: float(checks - next(clock)))
-    limits = None if cost.length else Limits(acceleration=4.0, torque=np.inf)
+    limits = Limits() if cost.length else Limits(acceleration=4.0, torque=np.inf)
     try:
         feasible, reason = plan_to_goal(request_of(BOX, cost=cost, limits=limits)).audit().feasible, ""
     except SolveError as error:

@@ -31,8 +31,10 @@ from models.spatial import quaternion_from_rotation
 from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, SolveError, Waypoints, joint_torques, plan, plan_problem
 from ocp.__main__ import main
 from ocp.motion.local.collisions import distances_along
+from ocp.motion.plan import dispatch
 from ocp.motion.result.margin import Margin
 from ocp.motion.result.segmented_plan import SequencePlan
+from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.targets import tip_poses
 from ocp.problem.values import Sampler
 from tests.ocp.motion.plan.test_plans_to_stand import reached
@@ -299,6 +301,16 @@ def fast_swing(robust: Any) -> Plan:
     limits = Limits(torque=TORQUE, robust=robust)
     machine = FixedBase(SWING, rotation=UPRIGHT)
     return plan(machine, Goal(joints=[1.2]), 2.0, start=[0.0], limits=limits, scene=False, cost=Cost(velocity=1.0))
+
+
+def test_a_robust_plan_that_is_not_found_fails_with_the_error_of_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> Plan:
+        raise DeadEnd("the arm is stuck", name="slider", time=0.4)
+
+    monkeypatch.setattr(dispatch, "_plan", refuse)
+    with pytest.raises(DeadEnd, match="leave room for the uncertainties, but the arm is stuck") as caught:
+        fast_swing({"payload": 1.0})
+    assert (caught.value.name, caught.value.time) == ("slider", 0.4)
 
 
 def test_robust_plans_cover_payload_and_friction_at_a_higher_cost(tmp_path: Path) -> None:

@@ -25,13 +25,13 @@ HALF = 0.2
 """Half of the thickness of the walls, m."""
 
 
-def search_of(boxes: list[Box]) -> TreeSearch:
-    return TreeSearch(StraightMotions(CollisionScene(slider(), boxes)), *LIMITS, ONES)
+def search_of(boxes: list[Box], start: Array = ONES, goals: Array = ONES) -> TreeSearch:
+    return TreeSearch(StraightMotions(CollisionScene(slider(), boxes)), start, np.atleast_2d(goals), *LIMITS, ONES)
 
 
 def paths_among(boxes: list[Box], start: Array, goal: Array, seed: int = 0, classes: int = 8) -> list[JointPath]:
     settings = PathSearchSettings(classes=classes)
-    return find_paths(search_of(boxes), start, np.atleast_2d(goal), limits=LIMITS, seed=seed, settings=settings)
+    return find_paths(search_of(boxes, start, goal), limits=LIMITS, seed=seed, settings=settings)
 
 
 def window(centre: float, width: float) -> list[Box]:
@@ -73,16 +73,16 @@ def test_a_window_a_fifth_wider_than_the_ball_is_found_and_a_narrower_one_is_not
     assert gap(dense(path.joints), boxes).min() >= -1e-6
     np.testing.assert_array_equal(path.joints[[0, -1]], [start, goal])
     settings = PathSearchSettings(classes=0, attempts=2)
-    closed = search_of(window(0.4, 1.9 * RADIUS))
-    assert not find_paths(closed, start, goal[None], limits=LIMITS, seed=seed, settings=settings)
+    closed = search_of(window(0.4, 1.9 * RADIUS), start, goal)
+    assert not find_paths(closed, limits=LIMITS, seed=seed, settings=settings)
     with time_limited(0.2), pytest.raises(TimeLimitReached):
-        find_paths(closed, start, goal[None], limits=LIMITS, seed=seed, settings=PathSearchSettings(attempts=100))
+        find_paths(closed, limits=LIMITS, seed=seed, settings=PathSearchSettings(attempts=100))
 
 
 def test_a_clear_straight_motion_to_the_nearest_goal_is_the_path() -> None:
     goals = np.array([[1.5, 1.5], [0.5, 1.0], [-1.0, -1.8]])
     boxes = [Box((0.2, 0.2, 1.0), (1.0, -1.0, 0.0))]
-    paths = find_paths(search_of(boxes), np.zeros(2), goals, limits=LIMITS, seed=0)
+    paths = find_paths(search_of(boxes, np.zeros(2), goals), limits=LIMITS, seed=0)
     assert [path.goal for path in paths] == [1, 2, 0]
     for path in paths:
         np.testing.assert_array_equal(path.joints, [np.zeros(2), goals[path.goal]])
@@ -102,11 +102,11 @@ def test_the_same_seed_gives_the_same_paths() -> None:
 def test_shortening_and_optimisation_never_lengthen_and_keep_ends_and_clearance(seed: int) -> None:
     random = np.random.default_rng(seed)
     boxes = [Box((*random.uniform(0.2, 0.7, 2), 1.0), (*random.uniform(-1.2, 1.2, 2), 0.0)) for _ in range(7)]
-    search = search_of(boxes)
     free = random.uniform(-2, 2, (200, 2))
     free = free[gap(free, boxes) > 0.02]
     scale = np.array([1.0, 2.0])
-    path = connect(search, free[0], free[1:2], random=random, most_samples=4000)
+    search = search_of(boxes, free[0], free[1])
+    path = connect(search, random=random, most_samples=4000)
     assert path is not None
     lengths = [path_length(path, scale)]
     for step in ("shorten", "optimise"):

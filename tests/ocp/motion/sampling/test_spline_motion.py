@@ -19,11 +19,17 @@ from ocp.motion.builders.constant_jerk import (
     stopping_motion,
 )  # fmt: skip
 from ocp.motion.sampling.joint_paths import StraightMotions
-from ocp.motion.sampling.spline_motion import MotionLimits, SplineCost, SplineMotionSettings, optimal_motion_near
+from ocp.motion.sampling.spline_motion import (
+    MotionLimits,
+    SplineMotionSettings,
+    has_spline_cost,
+    optimal_motion_near,
+    square_weights,
+)
 from tests.ocp.motion.sampling.sliders import gap, slider
 
 REST = np.zeros(2)
-TIME = SplineCost(1.0, np.zeros((3, 6)))
+TIME = Cost(velocity=0.0, time=1.0)
 BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))
 AROUND = np.array([[-1.0, 0.1], [-0.3, 0.801], [0.3, 0.801], [1.0, 0.1]])
 """Path around the box with corners near it."""
@@ -63,6 +69,13 @@ def test_without_obstacles_the_time_is_that_of_the_slowest_joint(jerk: float) ->
             motion = optimal_motion_near(limits, path, TIME, settings=SplineMotionSettings(gains=(1e-2, gain)))
             assert motion.duration == pytest.approx(least, rel=tolerance)
         np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-9)
+
+
+def test_the_zeros_of_the_joints_do_not_matter() -> None:
+    limits = limits_of(acceleration=[4.0, 2.0], jerk=400.0)
+    path, away = np.array([[-0.9, 0.4], [0.3, 0.1]]), np.array([1.2, 0.3])
+    here, there = (optimal_motion_near(limits, path + offset, TIME) for offset in (0.0, away))
+    np.testing.assert_allclose(there.durations, here.durations, rtol=1e-6, atol=1e-9)
 
 
 def ruckig_duration(path: Array, ends: tuple[Array, Array], bounds: Any) -> float:
@@ -145,8 +158,7 @@ def integrals(motion: Any, order: int) -> Array:
 @pytest.mark.parametrize("jerk", [np.inf, 400.0])
 def test_squared_velocities_within_acceleration_limits_are_those_of_the_closed_form(jerk: float) -> None:
     limits = limits_of(velocity=np.inf, acceleration=[4.0, 2.0], jerk=jerk)
-    cost = SplineCost.of(Cost(weights=[1.0, 3.0]), 2)
-    assert cost is not None
+    cost = Cost(weights=[1.0, 3.0])
     random = np.random.default_rng(3)
     for _ in range(3):
         path = random.uniform(-1, 1, (2, 2))
@@ -162,8 +174,7 @@ def test_squared_velocities_within_acceleration_limits_are_those_of_the_closed_f
 def test_squared_accelerations_and_jerks_are_those_of_polynomials(order: int, factor: float) -> None:
     """The cubic and, with accelerations of zero at the ends, the quintic polynomial."""
     limits = limits_of(velocity=np.inf)
-    cost = SplineCost.of(Cost(velocity=0.0, **{("acceleration", "jerk")[order - 2]: 1.0}), 2)
-    assert cost is not None
+    cost = Cost(velocity=0.0, **{("acceleration", "jerk")[order - 2]: 1.0})
     path, duration = np.array([[-1.0, 0.2], [0.7, 0.5]]), 1.7
     motion = optimal_motion_near(limits, path, cost, duration)
     least = factor * (np.diff(path, axis=0)[0] ** 2).sum() / duration ** (2 * order - 1)
@@ -172,8 +183,7 @@ def test_squared_accelerations_and_jerks_are_those_of_polynomials(order: int, fa
 
 def test_in_free_time_the_duration_balances_its_own_weight_against_velocities() -> None:
     limits, weight = limits_of(velocity=np.inf, acceleration=20.0), 2.0
-    cost = SplineCost.of(Cost(velocity=1.0, time=weight), 2)
-    assert cost is not None
+    cost = Cost(velocity=1.0, time=weight)
     path = np.array([[-1.0, 0.0], [0.5, 0.0]])
     motion = optimal_motion_near(limits, path, cost)
     times = np.linspace(0.6, 3.0, 2401)
@@ -185,8 +195,7 @@ def test_in_free_time_the_duration_balances_its_own_weight_against_velocities() 
 
 @pytest.mark.parametrize("jerk", [np.inf, 40.0])
 def test_around_a_box_squared_velocities_are_less_than_with_stops(jerk: float) -> None:
-    limits, cost = limits_of(BOX, velocity=np.inf, acceleration=4.0, jerk=jerk), SplineCost.of(Cost(), 2)
-    assert cost is not None
+    limits, cost = limits_of(BOX, velocity=np.inf, acceleration=4.0, jerk=jerk), Cost()
     stopping = stopping_motion(AROUND, limits.bounds, limits.torques)
     motion = optimal_motion_near(limits, AROUND, cost, 2 * stopping.duration)
     length = float(np.linalg.norm(np.diff(AROUND, axis=0), axis=1).sum())
@@ -197,8 +206,7 @@ def test_around_a_box_squared_velocities_are_less_than_with_stops(jerk: float) -
 
 
 def test_a_horizon_that_is_too_short_is_refused() -> None:
-    cost = SplineCost.of(Cost(), 2)
-    assert cost is not None
+    cost = Cost()
     path = np.array([[-1.0, 0.0], [1.0, 0.0]])
     for horizon in (1.0, 1.4):  # 2 sqrt(2 / 4) s are needed
         with pytest.raises(SolveError, match="no motion within the limits"):
@@ -207,12 +215,11 @@ def test_a_horizon_that_is_too_short_is_refused() -> None:
 
 
 def test_other_terms_have_no_spline_cost() -> None:
-    assert SplineCost.of(Cost(effort=1.0), 2) is None
-    assert SplineCost.of(Cost(velocity=0.0, length=1.0), 2) is None
-    cost = SplineCost.of(Cost(velocity=2.0, time=3.0, acceleration=[1.0, 4.0], jerk=5.0, weights=[1.0, 0.5]), 2)
-    assert cost is not None
-    assert cost.time == 3.0
-    np.testing.assert_allclose(cost.squares, [[1.0, 0.5], [1.0, 4.0], [5.0, 5.0]])
+    assert not has_spline_cost(Cost(effort=1.0))
+    assert not has_spline_cost(Cost(velocity=0.0, length=1.0))
+    cost = Cost(velocity=2.0, time=3.0, acceleration=[1.0, 4.0], jerk=5.0, weights=[1.0, 0.5])
+    assert has_spline_cost(cost)
+    np.testing.assert_allclose(square_weights(cost, 2), [[1.0, 0.5], [1.0, 4.0], [5.0, 5.0]])
 
 
 def test_powers_of_an_arm_are_at_their_limits_and_not_beyond() -> None:

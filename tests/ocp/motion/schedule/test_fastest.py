@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -32,7 +32,6 @@ from ocp.motion.schedule import grid as grids
 from ocp.motion.schedule import stretch as stretches
 from ocp.motion.schedule.grid import make_grid
 from ocp.motion.schedule.ramps import reachability_passes
-from ocp.motion.tasks.speed_profile import integrate_jerk, profile_through
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.families import some
 from tests.models.paths.task_paths import random_arm_path, seeds, turned
@@ -154,21 +153,6 @@ def test_the_passes_equal_a_linear_program(seed: int, rows: int, reverses: bool)
         assert x.sum() == pytest.approx(-result.fun, rel=1e-9)
     assert np.array(equal) @ solution == pytest.approx(0, abs=1e-12)
     assert x.sum() <= -result.fun * (1 + 1e-9)
-
-
-@settings(max_examples=50)
-@given(seeds)
-def test_two_jerks_lead_through_any_motion(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    t, first, second = rng.uniform(0.1, 1), *rng.normal(size=2)
-    v, a = rng.uniform(2, 4), rng.normal()
-    middle = integrate_jerk(v, a, first, t)
-    end = integrate_jerk(*middle[1:], second, t)
-    assume(min(middle[0], end[0], middle[1], end[1]) > 0)
-    states = np.array([[0.0, v, a], [middle[0] + end[0], *end[1:]]]).T
-    result = profile_through(*states)
-    assert result.jerk == pytest.approx([first, second], rel=1e-6, abs=1e-6)
-    assert result.duration == pytest.approx(2 * t, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", some([38, 41], [41]))
