@@ -125,13 +125,14 @@ class Grid:
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
         return rows.take(slice(count)), rows.take(right)
 
-    def split(self, parts: NDArray[np.intp]) -> Grid:
-        """Return a grid with each interval split into a number of equal parts (N,)."""
-        ends, at = np.cumsum(parts), np.repeat(np.arange(len(parts)), parts)
-        inside = (np.arange(ends[-1]) - np.repeat(ends - parts, parts)) / parts[at]
-        s = np.append(self.distance[at] + inside * np.diff(self.distance)[at], self.distance[-1])
-        jumps = ends[self.jumps - 1]
-        return Grid(self.path, self.limits, self.joints, s, self.requested[at], jumps, self.before, self.sharp)
+    def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
+        """Return the grid of the N intervals from a node on, each split into a number of equal parts (N,)."""
+        last, ends, at = first + len(parts), np.cumsum(parts), np.repeat(np.arange(len(parts)), parts)
+        begin, h = self.distance[first:last], np.diff(self.distance[first : last + 1])
+        s = np.append(begin[at] + fractions(parts) * h[at], self.distance[last])
+        own = (self.jumps > first) & (self.jumps <= last)
+        jumps, requested = ends[self.jumps[own] - first - 1], self.requested[first:last][at]
+        return Grid(self.path, self.limits, self.joints, s, requested, jumps, self.before[own], self.sharp)
 
     def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
@@ -324,6 +325,12 @@ def limit_slope(values: Array, gain: Array) -> Array:
     """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
+
+
+def fractions(parts: NDArray[np.intp]) -> Array:
+    """Return where the parts of intervals begin if each is split into a number of equal parts (N,), as its fraction."""
+    at, begin = np.repeat(np.arange(len(parts)), parts), np.cumsum(parts) - parts
+    return np.asarray((np.arange(len(at)) - begin[at]) / parts[at])
 
 
 def node_minimum(of_intervals: Array) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from models.checks import Array
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.schedule.grid import GAUSS, Grid, acceleration_bounds, limit_slope, node_minimum, reachable_squares
+from ocp.motion.schedule.grid import SETTINGS as GRID_SETTINGS
 from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
@@ -50,6 +51,8 @@ class StretchSettings:
         rounds: Largest number of rounds of tightening the limits.
         unused: Share of the time by which intervals are longer whose middle uses no limit up though an end does, above
             which they are halved.
+        lost: Predicted share of the time that a motion loses because its jerk is constant in each interval: the
+            promised accuracy.
         exceeded: Share by which a motion without jerk limits may exceed limits between nodes: half of the promised
             accuracy of 1e-3.
         parts: Largest number of parts into which an interval is split at once.
@@ -63,13 +66,12 @@ class StretchSettings:
         start, again: Initial squared speed over that of a fastest steady motion with bounded acceleration, and over
             that of the solution of a similar program.
         again_inside: Further factor if that start fails.
-        ratios: Least and greatest ratio of the speed where an interval begins to its mean, for rough motions.
         center, center_again: Initial complementarity over the time for these starts.
     """
 
     rounds: int = 20
     unused: float = 1e-4
-    unused_jerk: float = 1e-5
+    lost: float = 1e-3
     exceeded: float = 5e-4
     parts: int = 8
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
@@ -81,7 +83,6 @@ class StretchSettings:
     start: float = 0.5
     again: float = 0.9
     again_inside: float = 0.3
-    ratios: tuple[float, float] = (0.5, 1.5)
     center: float = 1.0
     center_again: float = 0.1
 
@@ -111,8 +112,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
             for margin, previous in zip(enforced.margins, behind.margins, strict=True):
                 margin[:part] = previous
             enforced.mask[:, :, :part], enforced.ratios[:part] = behind.mask, behind.ratios
-        x, slope, window, enforced, moved_seam = _tighten(window, enforced, seam)
-        at = moved_seam - begin
+        x, slope, window, enforced, at = _tighten(window, enforced, seam)
         parts.append(motion_profile(window, x[: at + 1], slope))
         if last:
             return join_profiles(parts)
@@ -122,7 +122,8 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, Array, Window, EnforcedRows, int]:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    The second motion shows the intervals to split; the window, its limits and the seam are returned as they then are.
+    The second motion shows the intervals to split; the window, its limits and the number of intervals before the seam
+    are returned as they then are.
     If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
     first intervals beyond the seam must keep the limits as well.
     """
@@ -148,36 +149,47 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
         violated = used > 1 + ROUNDING_SHARE
         affected = np.asarray(violated.any(axis=(0, 2)))
         if not affected[:checked].any() and accuracy == accuracies[-1]:
-            return x, slope, window, enforced, seam
+            return x, slope, window, enforced, seam - window.first
         if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
         enforced.lower(used, enforced.enforce(violated, values), window.rows[0], seam - window.first)
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
         if number == 1:
-            parts = _switching_parts(window, enforced, seam, profile, values)
-            grid, added = window.grid, int(parts.sum()) - len(parts)
-            grid = grid.split(np.pad(parts, (window.first, len(grid.requested) - window.last), constant_values=1))
-            window = Window.build(Stretch(grid, 0, 0), window.first, window.last + added, window.ends)
-            enforced, seam, every = enforced.take(np.repeat(every, parts)), seam + added, np.arange(parts.sum())
-            motion, free = profile.at_distance(window.nodes), every
-            start = motion.speed**2, 2 * motion.acceleration
+            parts = _parts_by_unused_jerk(window, seam, profile, values)
+            grid, at = window.grid.split(window.first, parts), int(parts[: seam - window.first].sum())
+            window, enforced, seam = (
+                Window.build(Stretch(grid, 0, 0), 0, len(grid.requested), window.ends),
+                enforced.split(parts),
+                at,
+            )
+            motion, free = profile.at_distance(window.nodes), np.arange(window.last)
+            start, every = (motion.speed**2, 2 * motion.acceleration), free
     worst = used[:, :checked].max(axis=(0, 2))
     place, largest = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
 
 
-def _switching_parts(
-    window: Window, enforced: EnforcedRows, seam: int, profile: SpeedProfile, values: Array
-) -> NDArray[np.intp]:
-    """Return into how many parts to split the intervals in which a motion uses no limit, as where its jerk switches."""
+def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
+    """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
+
+    If the share u of the limits is unused in an interval of duration T with mean jerk (1 - u) J, the greatest jerk J
+    followed by -J would lead to a speed that is u (2 - u) J T^2 / 4 higher. At acceleration a, that takes time as the
+    speed over a. On the way to the top speed, half of this time is saved on average, and 1 / n^2 of it in n parts.
+    """
     requested = window.grid.requested[window.first : window.last]
     speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
-    unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0) * np.diff(profile.t[::2])
-    parts = np.clip(np.ceil(unused / (SETTINGS.unused_jerk * profile.duration)), 1, SETTINGS.parts)
-    parts[: enforced.inherited] = parts[seam - window.first :] = 1
-    return np.asarray(parts, dtype=np.intp)
+    unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0)
+    time, a = np.diff(profile.t[::2]), np.abs(profile.acceleration[::2])
+    sharp = np.abs(window.rows[2].jerk[:, :, 0]).max(axis=1)
+    build_up = np.maximum(a[:-1], a[1:]) * sharp
+    loss = unused * time**2 * (2 - unused) / np.maximum(8 * build_up, (2 - unused) * time)
+    loss[seam - window.first :] = 0.0
+    # the sum of loss / n^2 for a given sum of n is least if n is proportional to the cube root
+    root = np.cbrt(loss)
+    parts = np.rint(root * np.sqrt(root.sum() / (SETTINGS.lost * profile.t[2 * (seam - window.first)])))
+    return np.asarray(np.clip(parts, 1, SETTINGS.parts), dtype=np.intp)
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
@@ -316,8 +328,8 @@ def _solve_with_jerk(
     cells = slice(low, high - 1)
     if known is not None and len(free) == end - begin:
         v, new = np.sqrt(known[0]), slice(max(low, enforced.inherited), high - 1)
-        ratios = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), *SETTINGS.ratios)
-        enforced.ratios[new] = ratios[new]
+        least = 2 / (1 + np.sqrt(1 + GRID_SETTINGS.rise))  # a greater rise is that of a rough motion
+        enforced.ratios[new] = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), least, 2 - least)[new]
     spline = Spline(nodes[inner], enforced.ratios[cells])
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0

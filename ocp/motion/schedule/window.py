@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
-from ocp.motion.schedule.grid import Grid
+from ocp.motion.schedule.grid import Grid, fractions
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
 from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, profile_through
 
@@ -179,6 +179,21 @@ class EnforcedRows:
         """Return the enforced limits in some intervals, as views of the same memory for a slice."""
         margins, times = self.margins.take(part), self.times.take(part)
         return EnforcedRows(margins, times, self.mask[:, :, part], self.ratios[part], self.inherited)
+
+    def split(self, parts: NDArray[np.intp]) -> EnforcedRows:
+        """Return the enforced limits after each interval is split into a number of equal parts (N,).
+
+        Splines before the split remain possible. Split intervals may use the limits fully, since what happens between
+        nodes decreases with their distance; a motion from the previous window keeps the limits there.
+        """
+        count = np.repeat(parts, parts)
+        rows = self.take(np.repeat(np.arange(len(parts)), parts))
+        rows.inherited = int(parts[: self.inherited].sum())
+        for margin, times in zip(rows.margins, rows.times, strict=True):
+            margin[count > 1], times[count > 1] = 1 - SETTINGS.room, 0.0
+        first, last = (np.sqrt(rows.ratios**2 + 4 * (1 - rows.ratios) * (fractions(parts) + x)) for x in (0, 1 / count))
+        rows.ratios = 2 * first / (first + last)
+        return rows
 
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.

@@ -162,7 +162,7 @@ def test_demands_equal_those_of_dense_samples() -> None:
     grid, plan = make_grid(path, limits, joints), schedule(path, limits, joints=joints)
     # the nodes of the plan, which splits intervals of the grid
     at = np.searchsorted(plan.profile.distance, grid.distance * (1 - 1e-12))
-    grid = grid.split(np.maximum(np.diff(at) // 2, 1))
+    grid = grid.split(0, np.maximum(np.diff(at) // 2, 1))
     stretch, every = Stretch(grid, 0, len(grid.requested)), np.arange(len(grid.requested))
     window = Window.build(stretch, 0, len(grid.requested), stretch.ends)
     motion = plan.profile.at_distance(grid.distance)
