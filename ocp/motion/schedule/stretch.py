@@ -158,11 +158,8 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
         if number == 1:
             parts = _parts_by_unused_jerk(window, seam, profile, values)
             grid, at = window.grid.split(window.first, parts), int(parts[: seam - window.first].sum())
-            window, enforced, seam = (
-                Window.build(Stretch(grid, 0, 0), 0, len(grid.requested), window.ends),
-                enforced.split(parts),
-                at,
-            )
+            window = Window.build(Stretch(grid, 0, 0), 0, len(grid.requested), window.ends)
+            enforced, seam = enforced.split(parts), at
             motion, free = profile.at_distance(window.nodes), np.arange(window.last)
             start, every = (motion.speed**2, 2 * motion.acceleration), free
     worst = used[:, :checked].max(axis=(0, 2))
@@ -174,9 +171,9 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
     """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
 
-    If the share u of the limits is unused in an interval of duration T with mean jerk (1 - u) J, the greatest jerk J
-    followed by -J would lead to a speed that is u (2 - u) J T^2 / 4 higher. At acceleration a, that takes time as the
-    speed over a. On the way to the top speed, half of this time is saved on average, and 1 / n^2 of it in n parts.
+    Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
+    u J T^2 / 4 higher. At acceleration a, that takes time as the speed over a, half of which is saved on average on the
+    way to the top speed. Of this loss, 1 / n^2 remains in n parts.
     """
     requested = window.grid.requested[window.first : window.last]
     speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
@@ -184,7 +181,7 @@ def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, valu
     time, a = np.diff(profile.t[::2]), np.abs(profile.acceleration[::2])
     sharp = np.abs(window.rows[2].jerk[:, :, 0]).max(axis=1)
     build_up = np.maximum(a[:-1], a[1:]) * sharp
-    loss = unused * time**2 * (2 - unused) / np.maximum(8 * build_up, (2 - unused) * time)
+    loss = unused * time**2 / np.maximum(8 * build_up, time)
     loss[seam - window.first :] = 0.0
     # the sum of loss / n^2 for a given sum of n is least if n is proportional to the cube root
     root = np.cbrt(loss)
