@@ -172,16 +172,15 @@ def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, valu
     """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
-    u J T^2 / 4 higher. At acceleration a, that takes time as the speed over a, half of which is saved on average on the
-    way to the top speed. Of this loss, 1 / n^2 remains in n parts.
+    u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
+    of this is saved on the way to the top speed. Of this loss, 1 / n^2 remains in n parts.
     """
     requested = window.grid.requested[window.first : window.last]
     speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
     unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0)
     time, a = np.diff(profile.t[::2]), np.abs(profile.acceleration[::2])
     sharp = np.abs(window.rows[2].jerk[:, :, 0]).max(axis=1)
-    build_up = np.maximum(a[:-1], a[1:]) * sharp
-    loss = unused * time**2 / np.maximum(8 * build_up, time)
+    loss = unused * time**2 / (8 * np.maximum(np.maximum(a[:-1], a[1:]) * sharp, time))
     loss[seam - window.first :] = 0.0
     # the sum of loss / n^2 for a given sum of n is least if n is proportional to the cube root
     root = np.cbrt(loss)
