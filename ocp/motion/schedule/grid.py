@@ -127,11 +127,10 @@ class Grid:
 
     def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
         """Return the grid of the N intervals from a node on, each split into a number of equal parts (N,)."""
-        last, ends, at = first + len(parts), np.cumsum(parts), np.repeat(np.arange(len(parts)), parts)
-        begin, h = self.distance[first:last], np.diff(self.distance[first : last + 1])
-        s = np.append(begin[at] + fractions(parts) * h[at], self.distance[last])
+        last, ends = first + len(parts), np.append(0, np.cumsum(parts))
+        s = np.interp(np.arange(ends[-1] + 1), ends, self.distance[first : last + 1])
         own = (self.jumps > first) & (self.jumps <= last)
-        jumps, requested = ends[self.jumps[own] - first - 1], self.requested[first:last][at]
+        jumps, requested = ends[self.jumps[own] - first], np.repeat(self.requested[first:last], parts)
         return Grid(self.path, self.limits, self.joints, s, requested, jumps, self.before[own], self.sharp)
 
     def blocks(self) -> list[tuple[int, int]]:
@@ -325,12 +324,6 @@ def limit_slope(values: Array, gain: Array) -> Array:
     """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
-
-
-def fractions(parts: NDArray[np.intp]) -> Array:
-    """Return where the parts of intervals begin if each is split into a number of equal parts (N,), as its fraction."""
-    at, begin = np.repeat(np.arange(len(parts)), parts), np.cumsum(parts) - parts
-    return np.asarray((np.arange(len(at)) - begin[at]) / parts[at])
 
 
 def node_minimum(of_intervals: Array) -> Array:

@@ -281,10 +281,8 @@ class _Constraints:
         self.sharp = self.bound[self.alone + self.jerk :].copy()
         self.bound[self.alone + self.jerk :] = 0.0
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))
-        shape = self.count, len(interval)
-        self.by_interval = scipy.sparse.csr_array(
-            (np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape
-        )
+        data = np.ones(len(interval)), np.argsort(interval, kind="stable"), ends
+        self.by_interval = scipy.sparse.csr_array(data, (self.count, len(interval)))
         block = self.interval // INTERIOR.block
         starts = np.diff(block, prepend=-1) != 0
         starts[self.count : self.count + 1] = True
@@ -297,10 +295,8 @@ class _Constraints:
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
-        gap, size = (
-            self._all_values(b, _weighted_sum(self.linear, coefficients)) - self.bound,
-            np.abs(self.bound) + 1e-300,
-        )
+        gap = self._all_values(b, _weighted_sum(self.linear, coefficients)) - self.bound
+        size = np.abs(self.bound) + 1e-300
         gap[sharp:] -= root
         size[sharp:] += root
         tangent = self.gradients[:, self.jerk :]
@@ -434,10 +430,9 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         per_slack, residual = 1 / slack, gap + slack
         weight = multiplier * per_slack
         squares = constraints.outer_products(weight)
+        hessian = [own + more for own, more in zip(curvature, squares, strict=True)]
         try:
-            equations = _BandSolver(
-                ends.reduce_hessian(*(own + more for own, more in zip(curvature, squares, strict=True)))
-            )
+            equations = _BandSolver(ends.reduce_hessian(*hessian))
         except np.linalg.LinAlgError:
             break
         gradient = slope + constraints.weighted_gradients(weight * residual)
@@ -459,15 +454,11 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             constraints.step_lengths(slack_change * per_slack, INTERIOR.to_boundary, INTERIOR.reduction),
             constraints.step_lengths(multiplier_change / multiplier, INTERIOR.to_boundary, INTERIOR.to_boundary),
         ]
-        shortest = [each.min() for each in lengths]
+        primal, dual = (each.min() for each in lengths)
         if uniform:
-            lengths = [np.full(count, each) for each in shortest]
+            lengths = [np.full(count, each) for each in (primal, dual)]
         else:
-            before = (
-                (b, shortest[0], change),
-                (slack, shortest[0], slack_change),
-                (multiplier, shortest[1], multiplier_change),
-            )
+            before = (b, primal, change), (slack, primal, slack_change), (multiplier, dual, multiplier_change)
         b = b + np.concatenate([lengths[0][:1], lengths[0], lengths[0][-1:]]) * change
         slack = slack + lengths[0].take(constraints.interval) * slack_change
         multiplier = multiplier + lengths[1].take(constraints.interval) * multiplier_change

@@ -104,8 +104,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         end = stretch.last if stretch.last - begin < SETTINGS.window + SETTINGS.overlap else begin + SETTINGS.window
         last = end == stretch.last
         seam = end if last else end - SETTINGS.overlap
-        goal = stretch.ends[1] if last else (0.0, 0.0)
-        window = Window.build(stretch, begin, end, (state, goal))
+        window = Window.build(stretch, begin, end, (state, stretch.ends[1] if last else (0.0, 0.0)))
         enforced = EnforcedRows.build(window)
         if behind is not None:
             enforced.inherited = part = len(behind.ratios)
@@ -123,9 +122,8 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
     The second motion shows the intervals to split; the window, its limits and the number of intervals before the seam
-    are returned as they then are.
-    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
-    first intervals beyond the seam must keep the limits as well.
+    are returned as they then are. If few intervals still violate limits, these are planned again with their neighbours,
+    between fixed motions. The first intervals beyond the seam must keep the limits as well.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
@@ -157,9 +155,11 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
         if number == 1:
             parts = _parts_by_unused_jerk(window, seam, profile, values)
-            grid, at = window.grid.split(window.first, parts), int(parts[: seam - window.first].sum())
-            window = Window.build(Stretch(grid, 0, 0), 0, len(grid.requested), window.ends)
-            enforced, seam = enforced.split(parts), at
+            grid, seam = window.grid.split(window.first, parts), int(parts[: seam - window.first].sum())
+            window, enforced = (
+                Window.build(Stretch(grid, 0, 0), 0, int(parts.sum()), window.ends),
+                enforced.split(parts),
+            )
             motion, free = profile.at_distance(window.nodes), np.arange(window.last)
             start, every = (motion.speed**2, 2 * motion.acceleration), free
     worst = used[:, :checked].max(axis=(0, 2))
@@ -291,13 +291,6 @@ def _usage_without_jerk(
     return used, np.maximum((vertex + error).max(axis=0), used.max(axis=0))
 
 
-def _row_speed_caps(left: Rows, right: Rows) -> Array:
-    """Return the greatest squared speeds that the speed limits on both sides of each node permit."""
-    left, right = (side.speed.max(axis=1, initial=0.0) for side in (left, right))
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
-
-
 def _solve_with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
@@ -308,31 +301,30 @@ def _solve_with_jerk(
     seam_shares = _seam_shares(window, seam)
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
-    caps = np.minimum(node_minimum(requested), _row_speed_caps(left, right) * node_minimum(shares.speed) ** 2)
+    first, inside, last = (rows.speed.max(axis=1, initial=0.0) for rows in (left, middle, right))
+    with np.errstate(divide="ignore"):
+        permitted = np.maximum(np.append(first, 0.0), np.insert(last, 0, 0.0)) ** -2.0
+        between = (inside / shares.speed) ** -2.0
+    caps = np.minimum(node_minimum(requested), permitted * node_minimum(shares.speed) ** 2)
     rates = acceleration_bounds(left, right, caps[:-1], caps[1:])
     reachable = reachable_squares(nodes, caps, rates, at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]
-    for side, resting in enumerate(at_rest):
-        if resting:
-            node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
-            rest[side] = float(width)
-            sharp = _rest_jerk(left, right, float(width), side, shares.jerk)
-            caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
-    inner = slice(low, high)
-    cells = slice(low, high - 1)
+    for side in np.flatnonzero(at_rest).tolist():
+        node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
+        rest[side] = float(width)
+        sharp = _rest_jerk(left, right, float(width), side, shares.jerk)
+        caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
+    inner, cells = slice(low, high), slice(low, high - 1)
     if known is not None and len(free) == end - begin:
         v, new = np.sqrt(known[0]), slice(max(low, enforced.inherited), high - 1)
         least = 2 / (1 + np.sqrt(1 + GRID_SETTINGS.rise))  # a greater rise is that of a rough motion
         enforced.ratios[new] = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), least, 2 - least)[new]
     spline = Spline(nodes[inner], enforced.ratios[cells])
-    with np.errstate(divide="ignore"):
-        between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
     upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
-    mask = enforced.mask
+    mask = enforced.mask.copy()
     if known is None:
-        mask = mask.copy()
         start = _initial_squares(nodes, np.minimum(reachable, caps), left, right, ends)[inner]
         b = np.concatenate([start[:1], np.minimum(start[:-1], start[1:]), start[-1:]])
         mask[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
@@ -346,12 +338,10 @@ def _solve_with_jerk(
             b[outermost], b[next_to] = x_end, x_end + signed_width * slope_end / 2
             upper[[outermost, next_to]] = np.inf
             fixed += [outermost, next_to]
-    own_shares = shares.take(cells)
-    in_motion = (not at_rest[0], not at_rest[1])
-    places = tuple(rows.take(cells) for rows in window.rows)
+    places, in_motion = tuple(rows.take(cells) for rows in window.rows), (not at_rest[0], not at_rest[1])
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
-    rows = _spline_rows(places, mask[:, :, cells], caps[inner], implied, own_shares, in_motion)
+    rows = _spline_rows(places, mask[:, :, cells], caps[inner], implied, shares.take(cells), in_motion)
     program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
         if known is None:
@@ -363,8 +353,7 @@ def _solve_with_jerk(
             b[at] = _resolve(part, b[at], accuracy)
     except SolveError as error:
         message = f"{error}; raise the limits, or keep the path away from singular arms"
-        details = {"name": "limits", "value": error.value, "limit": error.limit, "time": error.time}
-        raise ProblemError(message, **details) from error
+        raise ProblemError(message, name="limits", value=error.value, limit=error.limit, time=error.time) from error
     x, slope = np.zeros(len(nodes)), np.zeros(len(nodes))
     x[inner], slope[inner] = spline.at_nodes(b)
     return x, slope

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
-from ocp.motion.schedule.grid import Grid, fractions
+from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
 from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, profile_through
 
@@ -183,15 +183,15 @@ class EnforcedRows:
     def split(self, parts: NDArray[np.intp]) -> EnforcedRows:
         """Return the enforced limits after each interval is split into a number of equal parts (N,).
 
-        Splines before the split remain possible. Split intervals may use the limits fully, since what happens between
-        nodes decreases with their distance; a motion from the previous window keeps the limits there.
+        Splines before the split remain possible. Split intervals may use the limits fully: what happens between nodes
+        decreases with their distance, and a motion from the previous window keeps the limits there.
         """
-        count = np.repeat(parts, parts)
-        rows = self.take(np.repeat(np.arange(len(parts)), parts))
+        rows, count = self.take(np.repeat(np.arange(len(parts)), parts)), np.repeat(parts, parts)
         rows.inherited = int(parts[: self.inherited].sum())
         for margin, times in zip(rows.margins, rows.times, strict=True):
             margin[count > 1], times[count > 1] = 1 - SETTINGS.room, 0.0
-        first, last = (np.sqrt(rows.ratios**2 + 4 * (1 - rows.ratios) * (fractions(parts) + x)) for x in (0, 1 / count))
+        number = np.arange(len(count)) - np.repeat(np.cumsum(parts) - parts, parts)
+        first, last = (np.sqrt(rows.ratios**2 + 4 * (1 - rows.ratios) * (number + k) / count) for k in (0, 1))
         rows.ratios = 2 * first / (first + last)
         return rows
 
@@ -291,8 +291,7 @@ def limit_usage(
     first = states(2 * which, profile.jerk[2 * which])
     last = states(2 * which + 2, profile.jerk[2 * which + 1])
     zero = np.zeros(count)
-    places = np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h])
-    inside = profile.at_distance(places)
+    inside = profile.at_distance(np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h]))
     quarter, met, three_quarter = (
         LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3)
     )

@@ -11,7 +11,7 @@ from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.schedule.grid import make_grid
 from ocp.motion.schedule.limits import limit_rows
 from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Constraints, least_time
-from ocp.motion.schedule.window import SETTINGS, Stretch, Window, limit_usage, motion_profile
+from ocp.motion.schedule.window import SETTINGS, EnforcedRows, Margins, Stretch, Window, limit_usage, motion_profile
 from ocp.motion.tasks.speed_profile import LineMotion
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
@@ -184,3 +184,48 @@ def test_demands_equal_those_of_dense_samples() -> None:
         # a joint's jerk may turn between places that are looked at, by less than the room that is left for it
         assert (side - most)[near].min() > -2 * SETTINGS.room
         assert (side - most)[side > 1 - 2 * SETTINGS.room].max() < 2 * SETTINGS.room
+
+
+@settings(max_examples=40)
+@given(seeds)
+def test_a_spline_remains_possible_when_its_intervals_are_split(seed: int) -> None:
+    """And split intervals get initial margins, while the others keep theirs."""
+    rng, count = np.random.default_rng(seed), 6
+    parts, nodes = rng.integers(1, 5, count), np.cumsum(rng.uniform(0.1, 1.0, count + 1))
+    margins = Margins(*(rng.uniform(0.5, 0.9, shape) for shape in ((count,), (count, 2), (count, 3))))
+    mask = rng.uniform(size=(4, 2, count, 6)) < 0.5
+    enforced = EnforcedRows(margins, margins.times(np.zeros(count)), mask, rng.uniform(0.5, 1.5, count), inherited=2)
+    fine = enforced.split(parts)
+    assert fine.inherited == parts[:2].sum()
+    at, new = np.repeat(np.arange(count), parts), np.repeat(parts > 1, parts)
+    for kind, before in zip(fine.margins, margins, strict=True):
+        assert (kind[new] == 1 - SETTINGS.room).all()
+        assert (kind[~new] == before[at][~new]).all()
+    assert (fine.mask == mask[:, :, at]).all()
+    spline, b = Spline(nodes, enforced.ratios), rng.uniform(0.5, 2.0, count + 2)
+    shares = np.concatenate([np.arange(n) / n for n in parts])
+    fine_nodes = np.append(nodes[at] + shares * np.diff(nodes)[at], nodes[-1])
+    finer = Spline(fine_nodes, fine.ratios)
+
+    def values(of: Spline, coefficients: np.ndarray, interval: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+        near = np.stack([coefficients[interval + k] for k in range(3)])
+        return np.asarray((of.basis(interval, fraction) * near).sum(axis=1))
+
+    x, slope, _ = values(spline, b, np.append(at, count - 1), np.append(shares, 1.0))
+    every, fraction = np.arange(len(at)), rng.uniform(size=len(at))
+    expected = values(spline, b, at, shares + fraction / parts[at])
+    assert values(finer, finer.through(x, slope), every, fraction) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+def test_a_split_grid_keeps_its_nodes_and_where_segments_meet() -> None:
+    path, _ = panda_path(4)
+    grid = make_grid(path, LineLimits(0.5, 5.0, 200.0, 5.0), None)
+    first, last = 3, int(grid.jumps[2])
+    parts = np.random.default_rng(0).integers(1, 5, last - first)
+    fine = grid.split(first, parts)
+    assert (fine.distance[np.append(0, np.cumsum(parts))] == grid.distance[first : last + 1]).all()
+    assert np.diff(fine.distance) == pytest.approx(np.repeat(np.diff(grid.distance[first : last + 1]) / parts, parts))
+    own = (grid.jumps > first) & (grid.jumps <= last)
+    assert (fine.distance[fine.jumps] == grid.distance[grid.jumps[own]]).all()
+    assert (fine.before == grid.before[own]).all()
+    assert (fine.requested == np.repeat(grid.requested[first:last], parts)).all()

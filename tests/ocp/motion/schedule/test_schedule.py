@@ -29,7 +29,6 @@ from ocp.motion.schedule import (
     schedule,
 )
 from ocp.motion.schedule.planner import SETTINGS
-from ocp.motion.schedule.stretch import SETTINGS as STRETCH
 from ocp.motion.tasks.speed_profile import reachable_speed
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
