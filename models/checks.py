@@ -119,7 +119,7 @@ class Checks:
         """Return the exception about an unknown name; its message lists known names, similar ones if there are any."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
-        similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
+        similar = [by_case[item] for item in similar_names(str(name).casefold(), by_case, 3)]
         listed = ", ".join(names[:MAX_LISTED]) or "none"
         listed += f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
         hint = f"did you mean {' or '.join(map(repr, similar))}?" if similar else f"known: {listed}"
@@ -349,6 +349,13 @@ def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tupl
             name = argument_of(label) if name is None else name
             warn(ModelWarning(f"{label} {value:g} {words}", name=name, value=value, limit=low), stacklevel=2)
             return
+
+
+def similar_names(name: str, known: Iterable[str], most: int = 2) -> list[str]:
+    """Return known names that a name abbreviates or lengthens, or else those of similar spelling, the nearest first."""
+    names = list(dict.fromkeys(known))
+    related = [each for each in names if min(len(each), len(name)) > 2 and each[: len(name)] == name[: len(each)]]
+    return related[:most] or get_close_matches(name, names, most, 0.5)
 
 
 def short_repr(instance: Any) -> str:

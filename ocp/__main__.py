@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from models.errors import ModelError, ModelWarning
+from ocp.app.check.joint_limits import CHECKED_LIMITS
 from ocp.app.files.safe_files import SUFFIXES
 from ocp.app.subcommands import (
     EXPORT_KINDS,
@@ -71,7 +72,7 @@ def _version() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status.
+    """Run the command `selfmotion` with the given arguments, and return its exit status.
 
     Raises:
         ProblemError: The arguments are not a list of texts.
@@ -354,10 +355,9 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     file.add_argument("--unwrap", action="store_true", help="unwrap whole turns of joints, as the controller does")
     file.add_argument("--names-confirmed", action="store_true", help="do not check for exchanged columns")
     limits = parser.add_argument_group("limits, besides those of the robot; rad, m, s, N; repeatable for each joint")
-    for quantity in ("velocity", "acceleration", "jerk", "torque"):
-        limits.add_argument(
-            f"--{quantity}", type=_limit, action="append", default=[], metavar="[JOINT=]MAX", help=f"largest {quantity}"
-        )
+    each: dict[str, Any] = {"type": _limit, "action": "append", "default": [], "metavar": "[JOINT=]MAX"}
+    for name in (kind.replace("_", "-") for kind in CHECKED_LIMITS):
+        limits.add_argument(f"--{name}", help=f"largest {name.replace('-', ' ')}", **each)
     limits.add_argument(
         "--share", type=float, default=LIMIT_SHARE, metavar="S", help="tolerance relative to a limit (default: 0.001)"
     )

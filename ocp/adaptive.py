@@ -69,7 +69,7 @@ class AdaptiveCollocation:
         compiled: bool = False,
         scaling: bool = True,
     ) -> AdaptiveProblem:
-        """Return the problem with the options of its solves; see :func:`ocp.methods.prepare`.
+        """Return an object that solves the problem with the given options; see :func:`ocp.methods.prepare`.
 
         ``compiled`` and ``scaling`` apply to the first mesh, where most of the iterations take place.
         """
@@ -140,7 +140,7 @@ class AdaptiveProblem:
             return self._refined(mesh, plan, parameters)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
-        """Return the plan of a first mesh after refinement by collocation."""
+        """Refine the mesh of a plan by collocation, and return the plan on the last mesh."""
         report(f"refining a plan of cost {plan.cost:.6g}")
         settings = RefinementSettings(
             limits={"lost": self.method.accuracy}, max_intervals=self.method.max_intervals, solver=self._how["solver"]
@@ -203,7 +203,7 @@ def _label(mesh: DirectMethod) -> str:
 
 
 def _descended(prepared: Prepared, plan: Solution) -> Solution:
-    """Return the plan, or one of lower cost next to it if it is a saddle; the plan itself if none is found."""
+    """Return a nearby plan of lower cost if the given plan is a saddle point, else the given plan."""
     try:
         return descend(prepared, plan) if plan.regularised else plan
     except SolveError:

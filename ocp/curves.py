@@ -40,7 +40,7 @@ class PiecewisePolynomial:
         return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
 
     def derivative(self) -> PiecewisePolynomial:
-        """Return the derivative with respect to the position, in the unit of the breaks; zero if there is one node."""
+        """Return the polynomials' derivative with respect to position, in the unit of the breaks; 0 for one node."""
         if len(self.nodes) == 1:
             return PiecewisePolynomial(self.breaks, self.nodes, np.zeros_like(self.values))
         slopes = np.einsum("ij,kjn->kin", differentiation_matrix(self.nodes), self.values)

@@ -142,7 +142,7 @@ def error_names(name: str) -> Iterator[None]:
 
 @contextmanager
 def problem_errors(prefix: str = "") -> Iterator[None]:
-    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields and a message after a prefix."""
+    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields, and a prefix to its message."""
     try:
         yield
     except ModelError as error:
@@ -160,7 +160,7 @@ def format_distinct(*numbers: float) -> list[str]:
 
 
 def values_within(value: Any, upper: float, name: str, problem: str) -> np.ndarray:
-    """Return times or distances, one number or a row, as an array of floats clipped to the range from 0 to `upper`.
+    """Return a time or distance, or several, as an array of floats clipped to the range from 0 to `upper`.
 
     The name of the argument begins the error message, and `problem` ends it for a number outside the range.
 

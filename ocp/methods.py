@@ -32,7 +32,7 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE
 @dataclass(frozen=True)
 class DescentSettings:
     """Settings of the descent from a stationary plan that is not a minimum: the maximum number of descents, and the
-    displacement of the guess relative to the range of the plan or of its bounds (absolute without either).
+    displacement of the guess relative to the range of the plan or of its bounds (absolute if there is no such range).
     """
 
     descents: int = 3
@@ -48,7 +48,7 @@ class PreparedProblem(Protocol):
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
     ) -> Solution:
-        """Solve the prepared problem with the given parameters from the given guess; see :func:`solve`."""
+        """Solve the prepared problem with given parameters from a given guess; see :func:`ocp.methods.solve`."""
         ...
 
 
@@ -68,7 +68,7 @@ class Method(Protocol[P_co]):
         compiled: bool = False,
         scaling: bool = True,
     ) -> P_co:
-        """Prepare a problem once for repeated solves; see :func:`prepare`."""
+        """Prepare a problem once for repeated solves; see :func:`ocp.methods.prepare`."""
         ...
 
 
@@ -394,7 +394,7 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Return solutions by name, or by the name of their method, such as ``Collocation legendre-3, 50``."""
+    """Check solutions, and return them by given names or those of the methods: ``Collocation legendre-3, 50``."""
     if isinstance(solutions, Mapping):
         require.each("certificate: solutions", solutions.values(), Solution)
         return require.mapping("certificate: solutions", solutions)
@@ -416,11 +416,11 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Return states and controls at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` ones, and
-    sizes.
+    """Return states and controls at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` fractions,
+    and the magnitudes of Hamiltonian and running cost.
 
-    The sizes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free horizon,
-    and the mean absolute running cost.
+    The magnitudes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free
+    horizon, and the mean absolute running cost.
     """
     lam = solution.costate_interpolant(reported)
     symbol = form.sym("lam", form.nx)

@@ -23,9 +23,8 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Solution
 from ocp.solution_data import Refinement, stack
-from ocp.switching import WARM_START_OPTIONS, locate_switches, nodes_at_switches
-from ocp.tightening import tighten
-from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
+from ocp.switching import locate_switches, nodes_at_switches
+from ocp.tolerances import RESOLVED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 INTEGRATION = "integration error, relative"
@@ -41,14 +40,12 @@ class RefinementSettings:
             :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By default the audit's own.
         max_intervals: Maximum number of intervals.
         solver: As for :func:`ocp.methods.prepare`.
-        tighten: Whether limits that no mesh satisfies between its points are tightened in the end (see
-            :func:`ocp.tightening.tighten`), if the cost increases by less than the plan may lose.
         target: Value of a row, relative to its limit, at which splitting aims: half, as the order of an error is
             uncertain.
         max_parts: Maximum number of parts into which an interval is split at once.
         least_width: Smallest width of an interval, relative to the horizon: less is rounding.
         rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
-        nearer: Largest ratio of a row to its best earlier value that counts as progress.
+        nearer: Largest ratio of a row's unresolved part to its best earlier value that counts as progress.
         same_switch: Distance of a switch from a node, relative to the horizon, below which the node is at the switch.
 
     Raises:
@@ -58,7 +55,6 @@ class RefinementSettings:
     limits: Mapping[str, Any] = field(default_factory=dict)
     max_intervals: int = 400
     solver: str = "ipopt"
-    tighten: bool = True
     target: float = 0.5
     max_parts: int = 4
     least_width: float = ROUNDING_SHARE
@@ -94,8 +90,8 @@ def refine(
     kept. Every round starts from the previous plan.
 
     Collocation with controls at the points gets a node at each switch: where a control jumps from limit to limit,
-    enters or leaves a singular arc, or where a state reaches or leaves its limit. If in the end nothing but limits is
-    exceeded between the points, they are tightened; see `RefinementSettings.tighten`.
+    enters or leaves a singular arc, or where a state reaches or leaves its limit. Where controls exceed their limits
+    between the points on every mesh, as the polynomials of a singular arc do, they are held over each interval.
 
     Args:
         problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
@@ -146,7 +142,7 @@ def refine_from(
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings(tighten=False))
+    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
 
 
 def _refine_mesh(
@@ -164,11 +160,16 @@ def _refine_mesh(
     intervals: list[int] = []
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     best: dict[str, float] = {}
-    idle, late = 0, False
-    moving, placed = isinstance(method, Collocation) and method.control == "points", np.zeros(0)
+    vain: dict[str, int] = {}
+    idle, late, placed = 0, False, np.zeros(0)
+    moving = isinstance(method, Collocation) and method.control == "points"
+    driven = {f"bounds of {name}" for name in solution.controls}
+    driven |= {owner for owner, controlled in zip(form.path.owners, form.path.uses_control, strict=True) if controlled}
+    if (form.path.equality & form.path.uses_control).any():  # held controls cannot follow the states
+        driven = set()
 
     def assess() -> tuple[list[_Row], list[_Row]]:
-        """Record the errors of the last plan; return all rows, and those beyond their limits."""
+        """Record the errors of the last plan; return all of these errors, and those that exceed their limits."""
         rows = _rows(form, p, solution, audit, tolerance, method)
         intervals.append(method.intervals)
         for kind, values in errors.items():
@@ -177,29 +178,34 @@ def _refine_mesh(
 
     while True:
         rows, beyond = assess()
-        nearer = [row for row in beyond if row.value < settings.nearer * best.get(row.name, np.inf)]
-        best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
-        idle = 0 if nearer else idle + 1
+        unresolved = {row.name: row.unresolved(np.diff(method.fractions)) for row in beyond}
+        nearer = [name for name, part in unresolved.items() if part < settings.nearer * best.get(name, np.inf)]
+        best |= {name: min(part, best.get(name, np.inf)) for name, part in unresolved.items()}
+        vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
+        idle = min(vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
-        if at_switches is not None and idle > settings.patience:  # nodes that keep moving stay where they are
-            at_switches, moving, idle = None, False, 0
-        if at_switches is None:
-            parts = _parts_per_interval(beyond, rows, method.fractions, settings)
-            finer = split(method.fractions, *parts, settings.max_intervals)
-        else:
+        if at_switches is not None and idle >= settings.patience:  # nodes at switches do not help
+            moving, at_switches, idle = False, None, 0
+        following = method
+        if at_switches is not None:
             finer, placed = at_switches
-        spent = (at_switches is None and idle >= settings.patience) or len(intervals) == settings.rounds
-        if not beyond or spent or np.array_equal(finer, method.fractions):
+            following = method.with_mesh(finer)
+        elif idle < settings.patience:
+            parts = _parts_per_interval(beyond, rows, method.fractions, settings)
+            following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
+        unchanged = np.array_equal(following.fractions, method.fractions)
+        vainly = max((vain[name] + settings.patience * unchanged for name in driven & vain.keys()), default=0)
+        if isinstance(method, Collocation) and method.control == "points" and vainly >= settings.patience:
+            # held over each interval, controls that oscillate on every mesh have no values but those of the solver
+            following, moving, unchanged, vain, best = replace(method, control="held"), False, False, {}, {}
+        if not beyond or unchanged or len(intervals) == settings.rounds:
             break
-        method = method.with_mesh(finer)
+        method = following
         result = _next(problem, method, {**arguments, "guess": solution}, settings)
         if result is None:
             late = True
             break
         solution, audit = result
-    if beyond and not late and (tightened := _tightened(problem, method, (solution, audit), arguments, settings)):
-        solution, audit = tightened
-        _, beyond = assess()
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {settings.max_intervals} intervals"
     idles = idle == settings.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
@@ -207,42 +213,6 @@ def _refine_mesh(
     history = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
     return replace(solution, refinement=refinement), audit
-
-
-def _tightened(
-    problem: Problem,
-    method: DirectMethod,
-    plan: tuple[Solution, Audit],
-    arguments: dict[str, Any],
-    settings: RefinementSettings,
-) -> tuple[Solution, Audit] | None:
-    """Return the plan under tightened limits and its audit; None unless it is feasible at hardly higher cost.
-
-    It is tried where nothing but limits fails, such as bounds of a control near a singular arc.
-    """
-    solution, audit = plan
-    failures = [finding for finding in audit.failures if finding.verdict == "feasible"]
-    limited = {f"bounds of {name}" for name in (*solution.states, *solution.controls)}
-    limited |= set(Formulation.of(problem).path.names)
-    if not (settings.tighten and failures and {finding.name for finding in failures} <= limited):
-        return None
-    excess = min(finding.limit for finding in failures if finding.limit is not None) / 2
-    largest = solution.cost + LIMIT_SHARE * abs(solution.cost)
-    options = {**WARM_START_OPTIONS, **(arguments["options"] or {})}
-    try:
-        result = tighten(
-            problem,
-            method,
-            tolerance=excess,
-            parameters=solution.parameters,
-            options=options,
-            guess=solution,
-            max_cost=largest,
-        )
-        checked = judge(problem, result, **settings.limits)
-    except (SolveError, TimeLimitReached):
-        return None
-    return (result, checked) if checked.feasible and result.cost <= largest else None
 
 
 def _shortfall(
@@ -319,6 +289,17 @@ class _Row(NamedTuple):
     order: int = 1
     grows: bool = False
 
+    def unresolved(self, widths: np.ndarray) -> float:
+        """Return the integral over the horizon of the error beyond its limit; ``widths`` (N,) are the interval widths.
+
+        Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
+        only once the intervals are narrow enough.
+        """
+        if self.errors is None:
+            return self.value
+        beyond = self.errors > 1.0
+        return float(widths[beyond] @ self.errors[beyond])
+
 
 class _Parts(NamedTuple):
     """Contributions of the mesh intervals to an error that the audit reports; the error is their sum or maximum.
@@ -332,7 +313,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions scaled to the maximum (or, if summed, to the mean) ``total``. Shape (N,)."""
+        """Return the contributions scaled so that their maximum (their mean if summed) is ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -420,6 +401,10 @@ def _mesh_at_switches(
     at, smeared = locate_switches(problem, solution)
     if not beyond or not (np.abs(at[:, None] - mesh).min(axis=1, initial=np.inf) > settings.same_switch).any():
         return None
+    # a node beside a wide interval did not cure it; in a narrow one the switch may still be, as the cost is stationary
+    # in its time: a cost known to a share locates it to the root of this share
+    tried = np.isin(mesh[:-1], placed) | np.isin(mesh[1:], placed)
+    smeared &= ~tried | (np.diff(mesh) <= RESOLVED_SHARE**0.5)
     finer = mesh
     if any(row.errors is not None and (row.errors[~smeared] > 1.0).any() for row in beyond):
         parts, error = _parts_per_interval(beyond, rows, mesh, settings)

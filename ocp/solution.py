@@ -234,9 +234,9 @@ class Solution:
         parts: dict[str, Any] = {pool: parts_of_phase(name, getattr(self, pool)) for pool in pools}
         for pool, kind in zip(pools, INTERPOLANTS, strict=True):
             columns = [own.startswith(f"{name}.") for own in getattr(self, pool)]
-            sizes = [values.shape[1] for values in getattr(self, pool).values()]
+            sizes = np.array([values.shape[1] for values in getattr(self, pool).values()], int)
             curve = getattr(self, kind)
-            parts[kind] = replace(curve, values=curve.values[:, :, np.repeat(columns, sizes)])
+            parts[kind] = replace(curve, values=curve.values[:, :, np.repeat(np.array(columns, bool), sizes)])
         phase = self.problem.declared.phases[name]
         grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
         places, weights = np.polynomial.legendre.leggauss(8)
@@ -291,7 +291,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan with the problem that was read from its file; raise ProblemError if the two do not match."""
+        """Return the plan with the problem from the same file attached; raise ProblemError if the two do not match."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:

@@ -65,7 +65,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivatives of a plan with respect to a parameter of k entries, and the range in which they are valid.
+    """Derivatives of a plan with respect to a parameter of k entries, and the parameter range in which they hold.
 
     Attributes:
         name, value: Name of the parameter, and its value. Shape (k,).
@@ -138,7 +138,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack the arrays (M, n) of a dictionary side by side; an empty dictionary gives an array of shape (like, 0)."""
+    """Stack the arrays (M, n) of a dictionary side by side; an empty dictionary gives ``like`` rows without columns."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 

@@ -57,7 +57,7 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 class Switches(NamedTuple):
-    """Switches of a plan: their fractions of the horizon, (k,), and the mesh intervals that smear them, (N,), bool."""
+    """Switches of a plan as fractions (k,) of the horizon, and a mask (N,) of mesh intervals that smear a switch."""
 
     fractions: np.ndarray
     smeared: np.ndarray
@@ -110,7 +110,7 @@ def locate_switches(problem: Problem, solution: Solution) -> Switches:
 
 @dataclass(frozen=True)
 class _Arcs:
-    """Quantities as polynomials on each interval, which can be extrapolated from two intervals to a point between.
+    """Limited quantities and controls of a plan as polynomials (arcs), one per mesh interval, that can be extrapolated.
 
     Attributes:
         breaks: Ends of the intervals. Shape (N + 1,).
@@ -123,10 +123,10 @@ class _Arcs:
     values: np.ndarray
 
     def crossing(self, i: int, j: int, columns: Any, spans: np.ndarray) -> float | None:
-        """Return where the arcs of intervals i and j meet, in the column with the largest jump, or in one with a kink.
+        """Return the horizon fraction where the extrapolated polynomials of intervals i and j meet at a jump or kink.
 
-        A jump must exceed a share of the column's span; it is where the arcs enclose the same area as the plan. Shape
-        of ``spans``: (m,). None if there is neither.
+        The column with the largest jump counts, above a share of its span; a jump is where the arcs enclose the same
+        area as the plan. Shape of ``spans``: (m,). None if there is neither.
         """
         first, last = (lagrange(self.nodes, np.array([end]))[0] for end in (0.0, 1.0))
         matrix, width = differentiation_matrix(self.nodes), np.diff(self.breaks)
@@ -155,7 +155,7 @@ class _Arcs:
 
 
 def _limited_values(form: Formulation, solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return limited quantities at the control nodes of all intervals, their limits, and whether they have a control.
+    """Return limited quantities at all control nodes, their limits, and whether a control occurs in each quantity.
 
     The values (M, m) are those of controls, path constraints with a control, states, and other path constraints.
     """

@@ -148,7 +148,7 @@ def _limits_of(form: Formulation, p: np.ndarray) -> Bounds:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return a text about the largest excess over a bound (see :func:`_excess`), and the fields of its error."""
+    """Return a text about the largest excess over a bound, given all excesses, and the fields of the SolveError."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)

@@ -213,7 +213,7 @@ class Stance(FixedBase):
         return inverse_dynamics(self.bodies, q, qd, qdd, **self._forces(others))
 
     def _forces(self, others: Mapping[str, Expression]) -> dict[str, Any]:
-        """Return loads of feet, gravity and pose of the root as keywords of `base_reaction` and `inverse_dynamics`."""
+        """Return arguments of `base_reaction` and `inverse_dynamics`: contact wrenches, gravity, pose of the root."""
         others = require.mapping("stance: others", others)
         if set(others) != set(self.other_feet):
             message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"

@@ -147,7 +147,7 @@ class Standing(FixedBase):
         return inverse_dynamics(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
 
     def _forces(self, wrenches: Sequence[Wrench]) -> dict[str, Any]:
-        """Return wrenches, gravity and pose of the foot as keywords of `base_reaction` and `inverse_dynamics`."""
+        """Return arguments of `base_reaction` and `inverse_dynamics`: external wrenches, gravity, pose of the foot."""
         return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:

@@ -18,6 +18,8 @@ from models.errors import ModelError
 from models.spatial import rotation
 
 Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
+UNLIMITED = float(np.finfo(float).max)
+"""Limit in a URDF file that stands for none, because readers refuse infinite ones."""
 ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
@@ -309,9 +311,9 @@ def urdf_text(
     """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip exactly.
 
     A tip frame that differs from its link's frame, (3,) and (3, 3) as in Robot, becomes a link "LINK_tip" on a fixed
-    joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. Infinite limits are
-    omitted, but urdfdom, and so ROS and Pinocchio, rejects revolute and prismatic joints without them: give such a
-    robot limits of effort and velocity, and of position on both sides or none, before writing.
+    joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. A revolute joint
+    without position limits becomes a continuous joint, which is the same. urdfdom, and so ROS and Pinocchio, requires
+    finite limits of effort and velocity, so that infinite limits are written as the largest number, `UNLIMITED`.
     """
     robot = ElementTree.Element("robot", name=name)
     if tip is not None and (translation.any() or not np.array_equal(rotation, np.eye(3))):
@@ -349,17 +351,18 @@ def _write_link(robot: ElementTree.Element, link: Link) -> None:
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
-    element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+    endless = joint.moves and joint.kind != "prismatic" and not np.isfinite([joint.lower, joint.upper]).any()
+    element = ElementTree.SubElement(robot, "joint", name=joint.name, type="continuous" if endless else joint.kind)
     _write_origin(element, joint.translation, joint.rotation)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=joint.child)
     if not joint.moves:
         return
     ElementTree.SubElement(element, "axis", xyz=_join_numbers(joint.axis))
-    limits = [limit for limit in ("effort", "velocity") if np.isfinite(getattr(joint, limit))]
-    limits += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
-    if limits:
-        ElementTree.SubElement(element, "limit", {limit: _join_numbers(getattr(joint, limit)) for limit in limits})
+    limits = {key: getattr(joint, key) for key in ("effort", "velocity", *(() if endless else ("lower", "upper")))}
+    if np.isfinite(list(limits.values())).any() or not endless:
+        written = {key: _join_numbers(np.clip(value, -UNLIMITED, UNLIMITED)) for key, value in limits.items()}
+        ElementTree.SubElement(element, "limit", written)
     if (tie := joint.mimic) is not None:
         numbers = {"multiplier": _join_numbers(tie.multiplier), "offset": _join_numbers(tie.offset)}
         ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)

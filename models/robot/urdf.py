@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
-from math import cos, isfinite, sin
+from math import copysign, cos, inf, isfinite, sin
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 from warnings import warn
@@ -23,7 +23,7 @@ import numpy as np
 from models.checks import MAX_LISTED, Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
-from models.robot.parts import MOMENTS, SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
+from models.robot.parts import MOMENTS, SHAPES, UNLIMITED, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 from models.robot.tree import replace_floating, replace_planar
 
 Source: TypeAlias = str | os.PathLike[str]
@@ -76,9 +76,10 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
     joint whose <limit> has only one of lower and upper has 0 for the other; with neither, or without <limit>, it has no
-    position limits. The same holds for effort and velocity. A floating joint between a massless root and its only child
-    means that the robot floats: both are omitted, and the base of `FreeFloating` moves in their place. Any other
-    floating or planar joint becomes a chain of joints with one degree of freedom, without limits, see
+    position limits. The same holds for effort and velocity, and a limit of `UNLIMITED` is none. A floating joint
+    between a massless root and its only child means that the robot floats: both are omitted, and the base of
+    `FreeFloating` moves in their place. Any other floating or planar joint becomes a chain of joints with one degree of
+    freedom, without limits, see
     `models.robot.tree`. A <mimic> of a fixed joint is ignored.
 
     Left out with one warning that names them, as other readers load such files: collision shapes with an edge, radius,
@@ -342,6 +343,7 @@ def _joint(element: ElementTree.Element) -> Joint:
     limits: dict[str, float] = {}
     if (limit := _only(element, "limit", owner)) is not None:
         limits = {key: number_of(limit, key, owner) for key in ATTRIBUTES["limit"] if key in limit.attrib}
+        limits = {key: copysign(inf, value) if abs(value) == UNLIMITED else value for key, value in limits.items()}
         if kind == "continuous":
             limits = {key: value for key, value in limits.items() if key in ("velocity", "effort")}
         elif "lower" in limits or "upper" in limits:
@@ -445,7 +447,8 @@ def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int, *
             raise ValueError
         values = [float(word) for word in text.split()]
     except ValueError:
-        hint = f": {XACRO}" if "${" in text or "$(" in text else ""
+        hint = ": write decimal points, and blanks between numbers" if "," in text else ""
+        hint = f": {XACRO}" if "${" in text or "$(" in text else hint
         raise ModelError(f"{place} is not numeric{hint}", name=key, value=text) from None
     if len(values) != count:
         raise ModelError(f"{place} has {len(values)} numbers, not {count}", name=key, value=text, limit=count)

@@ -249,7 +249,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of rigid parts with bodies that are connected directly or through parts without bodies."""
+        """Return the pairs of rigid parts in `bodied` that have no other part of `bodied` between them in the tree."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)

@@ -204,7 +204,11 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
     """Return the pairs of links whose collision check an SRDF file disables, without pairs with unknown links."""
     known = {link.name for link in robot.links}
-    elements = parse_urdf(source).findall("disable_collisions")
+    root = parse_urdf(source)
+    if root.find("joint") is not None:
+        message = f"the SRDF file of {robot.name!r} has a <joint>: it is a URDF; give the file of <disable_collisions>"
+        raise ModelError(message, name="srdf", value="joint")
+    elements = root.findall("disable_collisions")
     pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
     if unknown := sorted({name for pair in pairs for name in pair if name not in known}):
         message = f"the SRDF file names links that {robot.name!r} does not have: {', '.join(map(repr, unknown))}"
@@ -339,7 +343,7 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds, m, of two bodies' distance at joint vectors (k, dof), and where balls do not suffice.
+        """Return lower bounds, m, of the distance at joint vectors (k, dof), and a mask where balls do not suffice.
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """

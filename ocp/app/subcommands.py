@@ -19,7 +19,7 @@ from models.files import cache_files, cache_folder
 from models.shapes.mesh_files import read_mesh
 from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
-from ocp.app.check.joint_limits import limits_by_name
+from ocp.app.check.joint_limits import CHECKED_LIMITS, limits_by_name
 from ocp.app.check.verdict import CheckTolerances, Interpretation, check_trajectory
 from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap, write_robot_program
 from ocp.app.files.exchange import ROBOT_LANGUAGES
@@ -45,7 +45,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
         checked_output("report", options.report, force=options.force)
     progress("reading the robot")
     robot = read_robot(options)
-    by_name = {kind: dict(getattr(options, kind)) for kind in ("velocity", "acceleration", "jerk", "torque")}
+    by_name = {kind: dict(getattr(options, kind)) for kind in CHECKED_LIMITS}
     limits = replace(limits_by_name(robot, {kind: of for kind, of in by_name.items() if of}), friction=options.friction)
     obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
     ignored, folders = tuple(options.ignore), tuple(options.folder)

@@ -63,7 +63,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose scales that make the backward sweep over the intervals well conditioned; no result depends on them.
+        """Choose scales of the variables that make the backward sweep well conditioned; results do not depend on them.
 
         Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
         Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
@@ -152,7 +152,7 @@ class AccessoryProblem:
 
     @property
     def negligible_cost(self) -> float:
-        """Cost below which a cost counts as zero: changes that a plan does not resolve reliably cost as much."""
+        """Largest cost that counts as zero, because a plan does not resolve changes of this cost reliably."""
         return max(LIMIT_SHARE * self.cost_scale, LIMIT_SHARE**2 * self.along.slope_size)
 
     @property
@@ -206,7 +206,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find controls that switch between limits inside an interval, and the second variation if switches shift."""
+        """Find controls that switch between limits inside an interval, and the cost's curvature in switching times."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))

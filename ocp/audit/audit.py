@@ -358,7 +358,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the finding about the largest violation of a constraint, judged by its size or by a `tolerance`."""
+    """Return the finding on the largest violation of a constraint, relative to its size or within a `tolerance`."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))

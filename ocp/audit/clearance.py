@@ -147,7 +147,7 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """List of one text about the pairs that are left out by assumption; an empty list if there are none."""
+        """List of one text about the pairs of bodies that are left out by assumption; empty if there are none."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
@@ -166,7 +166,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 def clearance_of_pairs(problem: Problem, solution: Solution, name: str, pairs: Sequence[int]) -> Clearance:
-    """Return the `clearance` of chosen pairs of bodies of a separation constraint; the closest pair has a tight bound.
+    """Return the `clearance` of chosen body pairs of a separation constraint; the bound of the closest pair is tight.
 
     Args:
         problem: The problem.
@@ -304,7 +304,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return why a prescribed motion keeps distance bounds from proving the clearance; "" if it does not."""
+        """Return why a jump of a prescribed motion prevents a proof of clearance; "" if no jump is too large."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -399,7 +399,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the start, as a fraction of the horizon, of time intervals, given by index and bisection level."""
+        """Convert index and bisection level of time intervals to their start times as fractions of the horizon."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level

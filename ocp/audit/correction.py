@@ -1,4 +1,4 @@
-"""Re-integration of a nearly exact plan by Newton corrections of its own states.
+"""Re-integration of a nearly exact plan by Newton's method, which corrects the states of the plan.
 
 The defects of the plan in its own dynamics, integrated over the samples of its fine grid and over further samples
 between them, drive the linear equation of its error (Ascher, Mattheij, Russell 1995, chapter 8). All intervals are

@@ -133,7 +133,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return the part of each node's reported costate that is due to multipliers in the mesh interval before it.
+    """Return the part of each node's reported costate that is due to multipliers in the mesh interval before the node.
 
     Multipliers count by the hat function of the node, and ``atoms`` by half if they are not distributed yet.
     """
@@ -200,7 +200,7 @@ class BackwardIntegration:
         self.drive = np.einsum("k,ij,kja->kia", h, ahead, self.source)
 
     def integrate(self, last: np.ndarray, inside: np.ndarray, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the costates at the Gauss points and just before every interval. Shapes (N q, nx) and (N, nx).
+        """Return the costates at the Gauss points and just before each interval's start. Shapes (N q, nx) and (N, nx).
 
         Args:
             last: Costates at the ends of the intervals. Shape (N, nx).
@@ -360,12 +360,12 @@ class EndLimits:
 
     @property
     def reach(self) -> np.ndarray:
-        """Effect of a multiplier of one, in units of cost. Shape (K,)."""
+        """First-order cost change per unit multiplier if states and horizon change by their sizes. Shape (K,)."""
         return np.asarray(np.abs(self.slope) @ self.unit)
 
     @property
     def scaled_slope(self) -> np.ndarray:
-        """Effect of a multiplier on the slope of the cost in each scaled entry, over its reach. Shape (K, 2 nx + 1)."""
+        """Signed gradient of each limit in the scaled x, x0 and T, divided by `reach`. Shape (K, 2 nx + 1)."""
         return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

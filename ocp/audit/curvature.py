@@ -125,7 +125,7 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 def _sweep(
     accessory: AccessoryProblem, sweep: _Linearised, tolerances: RankTolerances = FULL_RANK, weak: bool = False
 ) -> Curvature:
-    """Sweep backwards over all stages (mesh intervals).
+    """Compute the second variation of the cost along a plan by a backward sweep over all stages (mesh intervals).
 
     Cost, step and curvature of a stage refer to (z, 1, controls), so that they include the slope of the cost.
 

@@ -28,7 +28,7 @@ MAX_DERIVATIVES = 3
 
 
 class Limits:
-    """Lower and upper limits of quantities at points of a plan, distances to the limits, and which may be active.
+    """Lower and upper limits of quantities at points of a plan: distances to them, and masks of possibly active limits.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -59,7 +59,7 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: Any) -> Limits:
-        """Return the limits at some of the points of the plan, given by a slice or an array of indices."""
+        """Return the limits at those points of the plan that a slice or an array of indices selects."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
@@ -80,7 +80,7 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """For upper, then lower limits: which may be active (equalities once), the distances, and the sign 1 or -1."""
+        """Mask of possibly active limits (equalities once), distances to them, and sign: upper, then lower limits."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
@@ -222,8 +222,8 @@ class Linearisation:
         rates.append(np.abs(self.row_y[:, :, constant]).max(axis=0, initial=0.0) / sizes.path[:, None])
         rates += [np.abs(self.end_y[:, k]) / rows for k in (constant, nx + constant)]
         lam = form.sym("lam", nx)
-        slopes = ca.gradient(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)
-        diagonal = ca.vertcat(*[ca.jacobian(slopes[k], form.x[k]) for k in constant.tolist()])
+        hessian = ca.hessian(self.scaled[0] + ca.dot(lam, self.scaled[1]), form.x)[0]
+        diagonal = ca.densify(ca.diag(hessian)[constant.tolist()])
         curvature = self.share @ form.sampled([diagonal], *self.point, (lam, self.costate))[0]
         curvature = curvature + sum(np.diag(self.final_yy)[k] for k in (constant, nx + constant))
         rates.append(np.sqrt(np.abs(curvature[None]) / 2 / (max(abs(self.solution.cost), sizes.cost) or 1.0)))
@@ -296,7 +296,7 @@ class Linearisation:
         self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
-        """Add state equalities as limits of the controls: differentiate them in time until a control appears.
+        """Add limits of the controls that state equalities imply: differentiate these in time until a control appears.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then
@@ -304,21 +304,23 @@ class Linearisation:
         """
         form, equal = self.form, np.flatnonzero(self.form.path.equality[self.still])
         arcs = np.zeros((len(self.s), len(equal), form.nu))
-        for which, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
-            rates = [form.signals_at(self.t, order) for order in range(MAX_DERIVATIVES + 1 if form.signals else 1)]
+        for which, orders, slopes in form.cached("arcs", lambda: arcs_of(form, self.still[equal])):
+            rates = [form.signals_at(self.t, order) for order in range(orders + 1)]
             values = slopes(*self.point[:2], self.t[:, None], *self.point[3:5], *rates)[0]
             arcs[:, which] = values.reshape(len(self.s), form.nu, len(which)).transpose(0, 2, 1)
         self.control_limits_u = np.concatenate([self.control_limits_u, arcs], axis=1)
         self.control_limits.extend(len(equal))
 
 
-def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
+def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, int, Sampler]]:
     """Group path constraints by their order, the number of time derivatives until a control appears.
 
     Returns:
-        For each order the indices of its rows, and a sampler of the derivatives of these with respect to the controls.
+        For each order the indices of its rows, a sampler of the derivatives of these with respect to the controls, and
+        before it the highest order of the time derivatives of signals that the sampler takes as arguments.
     """
-    at, remaining, arcs = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
+    at, remaining = form.path.expression[rows.tolist()], np.arange(len(rows))
+    arcs = list[tuple[np.ndarray, int, Sampler]]()
     rates = [form.sym("w_rate", form.w.numel()) for _ in range(MAX_DERIVATIVES)] if form.signals else []
     for _ in range(MAX_DERIVATIVES):
         if not remaining.size or not form.nu:
@@ -328,7 +330,9 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
         in_control = ca.jacobian(at, form.u)
         seen = np.array(ca.DM(in_control.sparsity(), 1).full().any(axis=1), bool)
         if seen.any():
-            arcs.append((remaining[seen], form.sampler([in_control[np.flatnonzero(seen).tolist(), :]], *rates)))
+            slopes = in_control[np.flatnonzero(seen).tolist(), :]
+            orders = max((k + 1 for k, rate in enumerate(rates) if ca.depends_on(slopes, rate)), default=0)
+            arcs.append((remaining[seen], orders, form.sampler([slopes], *rates[:orders])))
             at, remaining = at[np.flatnonzero(~seen).tolist()], remaining[~seen]
     return arcs
 

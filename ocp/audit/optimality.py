@@ -113,7 +113,7 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits, as variables of a quadratic program whose cost weights them by gaps.
+    """Nonnegative multipliers of limits, as variables of a quadratic program with distances to the limits as prices.
 
     Attributes:
         point, limit: Indices of the point and of the limit of each multiplier. Shape (K,).
@@ -399,12 +399,12 @@ def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.nda
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return a plan's excess cost over the optimum for given multipliers, without what a change of start saves."""
+    """Return a plan's excess cost over the optimum for given multipliers, except the cost that a new start saves."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the measure that compares multipliers: excess cost of the plan plus errors of the multipliers."""
+    """Return the error of multipliers, in units of cost: the excess cost they imply plus errors of their equations."""
     assert curved is not None
     loss = _total_loss(_loss_by_interval(along, multipliers, curved), multipliers)
     return loss + multipliers.total + multipliers.ends.transversality

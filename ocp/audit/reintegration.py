@@ -111,9 +111,9 @@ def integrated_motion(along: Linearisation) -> IntegratedMotion:
 
 
 def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> IntegratedMotion | None:
-    """Return the motion that the controls of a plan produce by implicit steps, which stiffness does not limit.
+    """Return the motion that the controls of a plan produce, by implicit integration, as stiff dynamics require.
 
-    They are the backward differentiation formulas of CVODES. None where they break down too.
+    The method is the backward differentiation formulas of CVODES. Returns None if it breaks down too.
 
     Args:
         along: The plan. starts: Its states at the start of every interval. Shape (N, nx).
@@ -236,7 +236,7 @@ class Flow:
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values after each of several integration steps, and their error estimates.
+        """Return states and cost after each of several integration steps, and their error estimates.
 
         A step starts where the previous one ends or, where ``first`` is set, at its own start.
         """
@@ -279,14 +279,14 @@ def step_function(form: Formulation, nodes: np.ndarray) -> Any:
 
 
 def _control_columns(solution: Solution) -> np.ndarray:
-    """Return the divided differences of the controls in every interval, its start and its width. Shape (N, nw + 2)."""
+    """Return each interval's divided differences of the controls, its start and its width. Shape (N, nw + 2)."""
     curve = solution.control_interpolant
     differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
     return np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
 
 
 def _newton_polynomial(differences: Any, nodes: np.ndarray, at: Any) -> Any:
-    """Return the value at a position of the polynomial with given divided differences, one column a node."""
+    """Evaluate, at `at`, the Newton polynomials whose divided differences are the columns of `differences`."""
     value = differences[:, -1]
     for i in range(len(nodes) - 2, -1, -1):
         value = differences[:, i] + (at - nodes[i]) * value

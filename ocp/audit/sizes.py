@@ -46,7 +46,7 @@ class FineGrid:
     p: np.ndarray
 
     def point(self, form: Formulation, at: slice = slice(None)) -> tuple[Any, ...]:
-        """Return samples, and the states and controls at the start, as arguments of :meth:`Formulation.sampled`."""
+        """Return data at the samples `at`, and states and controls at the start, for :meth:`Formulation.sampled`."""
         starts = (form.x0, self.states[0]), (form.u0, self.controls[0])
         return self.states[at], self.controls[at], self.t[at], self.horizon, self.p, *starts
 
@@ -171,7 +171,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes of sampled states or controls, and which vary or have a nonzero fixed end. Shape (n,) each.
+    """Return (n,) sizes of sampled states or controls, and a mask of those that vary or have a nonzero fixed end.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -186,7 +186,7 @@ def _sizes_of(
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
-    """Return the smallest magnitude of the finite, nonzero bounds of each entry; inf without any. Shape (n,)."""
+    """Return the smallest magnitude of the finite, nonzero bounds of each quantity; inf without any. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
@@ -194,7 +194,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes, raised to a minimum for entries that stay at zero, and a mask of the entries that do not."""
+    """Return sizes, raised to a minimum for quantities that stay at zero, and a mask of all other quantities."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -257,7 +257,7 @@ def _sizes_by_unit(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) ->
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the sizes of watched constraints: lengths of reference paths, or changes if the variables change.
+    """Return the sizes of watched constraints: the length of a reference path, else the change with the variables.
 
     Args:
         by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).

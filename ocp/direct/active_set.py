@@ -375,18 +375,18 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the indices in `cholesky`'s argument of entries in rows ``first``, columns ``second`` <= ``first``."""
+        """Return the index of matrix entries (row ``first``, column ``second``) in the input of :meth:`cholesky`."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
 
     @property
     def length(self) -> int:
-        """Number of matrix values that :meth:`cholesky` takes."""
+        """Length of the vector of matrix entries for :meth:`cholesky`."""
         return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
 
     def cholesky(self, values: np.ndarray) -> Cholesky | None:
-        """Return the Cholesky factors of a matrix; None if it is not positive definite or not finite.
+        """Return the Cholesky factors of a bordered banded matrix; None if it is not positive definite or not finite.
 
         Args:
             values: Lower triangle, each entry at the index of :meth:`at`, and 0 elsewhere. Overwritten.

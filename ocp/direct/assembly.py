@@ -90,7 +90,7 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """The casadi Function ``values``, mapped over all intervals."""
+        """The casadi Function that computes the state values in all mesh intervals by one call."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 
@@ -156,7 +156,7 @@ class Transcription:
         return self.nodes[:, -1]
 
     def duration(self, form: Formulation, variables: np.ndarray, p: np.ndarray) -> float:
-        """Return the horizon (final time), s: the value of its variable, or the fixed one at given parameters."""
+        """Return the horizon (final time), s, from its variable if the horizon is free, else from the parameters."""
         return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
@@ -421,7 +421,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the places in the program's upper Hessian triangle to which a block's Hessian adds, and factors."""
+    """Return (row, column) in the program's Hessian, and factor, for each nonzero of a block's upper Hessian."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -481,7 +481,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return the sparse sum of constant entries and of the nonzeros of ``matrices``, times factors, at their places."""
+    """Return a sparse matrix: the sum of constant entries and weighted nonzeros of ``matrices``, at given positions."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

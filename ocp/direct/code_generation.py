@@ -200,7 +200,7 @@ def _compile(text: str) -> bytes:
 
 
 def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """Start a command whose output goes to a file in its working folder, and which ends when its input is closed."""
+    """Start a command that writes its output to a file in its working folder and ends when its input is closed."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],

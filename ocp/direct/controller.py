@@ -93,7 +93,7 @@ class ControlStep:
 
     @property
     def violation(self) -> float:
-        """The larger one of the violations of dynamics and limits."""
+        """The larger of the violations of the dynamics and of the limits."""
         return max(self.dynamics_violation, self.limit_violation)
 
     @cached_property
@@ -128,7 +128,7 @@ class Controller:
         self.reset(plan)
 
     def reset(self, plan: Solution) -> None:
-        """Start again from a plan; the next step does not shift it.
+        """Restart the controller from a plan, which the next step does not shift in time.
 
         Raises:
             ProblemError: The plan is not a solution of the prepared problem.
@@ -152,7 +152,7 @@ class Controller:
         self._is_first, self._last = True, dict[str, np.ndarray]()
 
     def step(self, parameters: ByName = None) -> ControlStep:
-        """Solve the problem for new parameters, among them the measured state, from the last step's shifted result.
+        """Solve the problem for new parameters, such as the measured state, from the previous step's shifted result.
 
         Raises:
             ProblemError: A parameter is missing, unknown, of a wrong size or not finite, or a bound is not a number or
@@ -244,7 +244,7 @@ class Controller:
         return write_c(form, [self._build(self._functions)[1]], "controller", folder=place, texts=texts)
 
     def _build(self, functions: ProgramFunctions) -> tuple[Any, Any]:
-        """Return the solver, and the casadi Function of a step, which solves again from another start if it fails."""
+        """Return the solver, and a casadi Function of a control step that solves again if a result is infeasible."""
         transcription, form, settings = self._prepared.transcription, self._prepared.formulation, self.settings
         x, p = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np)
         cost, rows = functions.values(x, p)
@@ -280,7 +280,7 @@ class Controller:
         return solver, ca.Function("controller_step", [p, x, lam_x, lam_g, is_shifted], final, names, list(OUTPUTS))
 
     def _attempt(self, solver: Any, functions: ProgramFunctions) -> Any:
-        """Return the casadi Function of one solve, with its bounds, its shifted start, and measures of its result."""
+        """Return a casadi Function that solves once from the last result and returns control, result and violations."""
         transcription, form = self._prepared.transcription, self._prepared.formulation
         x, p, is_shifted = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np), ca.MX.sym("shift")
         lam_x, lam_g = ca.MX.sym("lam_x", transcription.size), ca.MX.sym("lam_g", transcription.n_rows)
@@ -339,7 +339,7 @@ class ProgramFunctions(NamedTuple):
 
 
 def program_functions(prepared: Any, hessian: str) -> ProgramFunctions:
-    """Return the functions of a prepared problem's nonlinear program with a kind of Hessian."""
+    """Return the functions of a prepared problem's nonlinear program, with an exact or a Gauss-Newton Hessian."""
     transcription, form = prepared.transcription, prepared.formulation
     blocks = [derivatives(block.function) for block in transcription.blocks]
     if hessian == "gauss-newton":

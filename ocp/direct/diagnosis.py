@@ -130,7 +130,7 @@ def diagnosis(
 
 
 def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]) -> list[str]:
-    """Return labels of declared constraints whose gradients are linearly dependent, with the time, the largest first.
+    """Return labels, with times, of constraints with linearly dependent gradients, in decreasing order of weight.
 
     They are the constraints with large entries in a vector y with J^T y = 0, found by inverse iteration with J J^T; J
     is the Jacobian of the equations, with rows of length 1, in the variables that are not fixed.
@@ -391,7 +391,7 @@ class _Soft:
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
     def conflicts(self, values: np.ndarray, horizon: float, units: np.ndarray) -> list[Conflict]:
-        """Return the violated constraints in decreasing order of violation, each in its own unit."""
+        """Return the violated constraints with violations in the constraints' units, in decreasing order."""
         low, high = self.bounds
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

@@ -93,7 +93,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each variable's and each constraint's counterpart a number of mesh intervals later.
+    """Return the index of each variable's and each constraint's counterpart ``intervals`` mesh intervals later.
 
     Where the horizon ends earlier, it is the index of the variable or row itself.
     """

@@ -358,7 +358,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
 
 
 def report_nodes(transcription: Transcription) -> np.ndarray:
-    """Return the index of the last node up to each reported point. Shape (M,)."""
+    """Return the index of the last mesh node at or before each reported point of a plan. Shape (M,)."""
     interval, place = transcription.report
     return np.asarray(interval + (place == 1.0))
 

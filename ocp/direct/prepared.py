@@ -230,7 +230,7 @@ class Prepared:
         shift: int,
         start: str,
     ) -> Solution:
-        """Solve by Newton steps near a known plan, else from the guess, other points or a relaxed problem."""
+        """Solve by Newton's method if the guess is a plan, else from the guess, other points or a relaxed problem."""
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -304,14 +304,14 @@ class Prepared:
             raise Interrupted(str(error), first.solution) from error
 
     def is_own_plan(self, guess: Guess) -> bool:
-        """Return whether a guess is a plan of this nonlinear program: same method, mesh, sizes and parameters."""
+        """Return whether a guess is a plan of this nonlinear program: same method, mesh, variables and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the optimum near a guess that is a plan, shifted by ``shift`` mesh intervals; None if not found."""
+        """Shift a given plan by ``shift`` mesh intervals, and return the optimum near it; None if there is none."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self.is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -382,7 +382,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales of the program for an initial point; ``names`` are variables with meaningful values."""
+        """Return the scales of the program for an initial point; ``names`` are the variables that the guess states."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, self._sizes(point, names, bounds, p), point, p)
@@ -392,7 +392,7 @@ class Prepared:
         return scales
 
     def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Sizes:
-        """Return the typical sizes of the variables at a guess; ``names`` are variables with meaningful values."""
+        """Return the magnitudes of the variables for an initial point; ``names`` are those that the guess states."""
         return sizes_along(self._pattern, point, names, bounds=bounds, p=p)
 
     @property

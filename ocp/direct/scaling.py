@@ -54,7 +54,7 @@ class ScalingSettings:
 
     @property
     def bad(self) -> float:
-        """Ratio of sizes, or of a state's change to its size, above which a problem counts as badly scaled."""
+        """Ratio of magnitudes, or of a state's change to its magnitude, above which a problem is badly scaled."""
         return self.usual**2
 
 
@@ -136,7 +136,7 @@ def unit_scales(transcription: Transcription) -> Scales:
 
 
 def scaled_program(program: Program) -> Program:
-    """Return the nonlinear program with variables, constraints and cost divided by scales, its new parameters.
+    """Return the nonlinear program with variables, constraints and cost divided by scales, which become parameters.
 
     The variables are x / a, the rows g / b, the cost f / c and the parameters (p, a, b, c). Only the functions that
     solvers use are replaced.
@@ -169,7 +169,7 @@ def scaled_program(program: Program) -> Program:
 def sizes_along(
     pattern: Pattern, point: np.ndarray, intended: Collection[str], *, bounds: Bounds, p: np.ndarray
 ) -> Sizes:
-    """Return the typical sizes of states, controls and horizon, derived from an initial point of the solver.
+    """Return the typical magnitudes of states, controls and horizon, derived from the solver's initial point.
 
     Args:
         point: Values of the variables.
@@ -223,7 +223,7 @@ def sizes_along(
 
 
 def _displaced(pattern: Pattern, point: np.ndarray, sizes: np.ndarray, ends: Bounds) -> np.ndarray:
-    """Return the point with states and controls displaced by a constant share of their range, their size, or 1.
+    """Return a point of the program with each state and control displaced by a share of its magnitude, range or 1.
 
     A derivative such as the cosine of a right angle may vanish at the guess, but does so nowhere near it.
 
@@ -259,7 +259,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Compute the scales of a nonlinear program from the sizes of its variables and its derivatives at a point."""
+    """Compute the scales of a nonlinear program from magnitudes of its variables and its derivatives at a point."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -307,7 +307,7 @@ def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales:
 
 
 def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
-    """Replace computed scales of variables by declared sizes, rounded to powers of two, where sizes are declared."""
+    """Replace computed scales of variables by declared magnitudes, if any, rounded to powers of two."""
     form = pattern.form
     declared = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
     declared[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
@@ -315,7 +315,7 @@ def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """Return scales: the nearest power of two for unusually large or small sizes, and 1 for the others."""
+    """Return scales: the nearest power of two for unusually large or small magnitudes, and 1 for all others."""
     unusual = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 

@@ -123,7 +123,7 @@ class TranscriptionBuilder:
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Declare that variables of given indices are entries of a state, control or the horizon, and set bounds.
+        """Declare that variables of given indices represent a state, control or the horizon, and set their bounds.
 
         Args:
             role: ``state``, ``control`` or ``horizon``.
@@ -219,7 +219,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare path constraints at every node; at the first node, only those that fixed initial states leave open.
+        """Declare path constraints at every mesh node; at the first, only those that fixed initial states leave open.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """

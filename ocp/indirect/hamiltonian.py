@@ -201,7 +201,7 @@ def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang:
 
 
 def check_constraints(form: Formulation) -> None:
-    """Raise ProblemError if the indirect method does not support a constraint of the problem, by its name."""
+    """Raise ProblemError, naming the constraint, if the indirect method does not support a constraint."""
     for name, place in form.states.items():
         index = form.bounds.places["state"][place]
         low, high = (bound[index] for bound in numeric_bounds(form))
@@ -339,10 +339,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
 def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Return the gradients of the terminal cost plus the start and end constraints times their multipliers.
-
-    They are with respect to the parameters, the horizon, the first state and the last state.
-    """
+    """Differentiate terminal cost plus multipliers times boundary constraints by parameters, horizon and end states."""
     form = ham.form
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])

@@ -247,7 +247,7 @@ class PreparedIndirect:
         return dataclasses.replace(seed, success=False, status=status, message=f"{why}{error}")
 
     def _check_order(self, root: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
-        """Reject a result whose bang-bang switches are out of order, or whose horizon is outside its bounds."""
+        """Reject a result of Newton's method with bang-bang switches out of order or a horizon outside its bounds."""
         if self.method.shooting == "backward" or not root.success:
             return root
         at = self.boundary.layout(arcs)

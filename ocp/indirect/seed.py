@@ -123,7 +123,7 @@ def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.n
 
 
 def signs(slope: np.ndarray) -> np.ndarray:
-    """Return the signs of sampled switching functions (M, n); samples near zero take that of the next that is not.
+    """Return the signs of sampled switching functions (M, n); a value near zero takes the next significant sign.
 
     After the last significant sample its sign continues. A switching function that vanishes at an end, for example at a
     free state, would have the sign of the seed's noise there.

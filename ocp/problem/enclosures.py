@@ -137,7 +137,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return bounds of the value and slope of fmin or fmax, from both operands where either may be the extreme one."""
+    """Return bounds of the value and slope of fmin or fmax; if the operands' ranges overlap, both slopes count."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     either = np.minimum(x.slope.low, y.slope.low), np.maximum(x.slope.high, y.slope.high)
@@ -283,7 +283,7 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the matrix that maps the entries of a frame to the corners of a body's bounding box in world coordinates.
+    """Return the matrix that maps a body's pose (12 numbers) to the corners of the body's bounding box in world.
 
     Shape (3 C, 12) for C corners. ``core`` are the points of the body in the frame.
     """

@@ -138,7 +138,7 @@ class ExpressionReader:
         return isinstance(column, self.symbols) and bool(ca.depends_on(column, self.time))
 
     def _inside_window(self, what: str, vector: Any, bounds: tuple[Any, Any], during: Value) -> Any:
-        """Return an expression that outside a window of time is replaced by a number inside its bounds."""
+        """Return an expression that equals a given one inside a time window, and a value within the bounds outside."""
         if not isinstance(during, tuple | list) or len(during) != 2:
             raise ProblemError(f"{what}: during must be two times, not {during!r}", name="during", value=during)
         begin, end = (self.column(f"{what}: during", part, 1, np.nan) for part in during)

@@ -76,7 +76,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors, to whose entries variables and constraints of a nonlinear program refer.
+    """All lower and upper bounds of a problem as two vectors, whose entries are functions of the parameters.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
@@ -88,7 +88,7 @@ class BoundTable:
     places: dict[str, np.ndarray]
 
     def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative of the sum of bounds times multipliers with respect to the parameters. Shape (np,).
+        """Return the gradient of the sum of bounds times multipliers with respect to the parameters. Shape (np,).
 
         ``multipliers`` (2, n) are those of the lower and of the upper bounds.
         """
@@ -96,7 +96,7 @@ class BoundTable:
 
     @cached_property
     def _pullback(self) -> Any:
-        """CasADi function of :meth:`pullback`: the transposed Jacobian of the point function times multipliers."""
+        """CasADi Function of :meth:`pullback`: the transposed Jacobian of the bounds times their multipliers."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)

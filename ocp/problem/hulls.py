@@ -187,7 +187,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of shapes to evaluate for given pairs of bodies: indices in `pair`, and indices in `rows`.
+        """Return R pairs of shapes to evaluate for K pairs of bodies: for each its places in `pair` and in `rows`.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
         """
@@ -212,7 +212,7 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of shortest distance between two bodies or the shapes that cover them, for rows of `CoveredPairs`.
+    """Directions of the shortest distance between the two bodies, or the two covering shapes, of each of R pairs.
 
     Attributes:
         place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
@@ -253,7 +253,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples; those above `near` are lower bounds. Shape (M, n), m.
+        """Return the distances of all pairs of bodies at all samples, as lower bounds above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -278,7 +278,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of pairs at given samples; those above `near` are lower bounds. Shape (K,), m."""
+        """Return the distances of pairs of bodies at given samples, as lower bounds above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -294,7 +294,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return separating directions, distances (K,), m, and nearest points of the cores (K, 2, 3), m, of pairs."""
+        """Return separating directions, distances (K,), m, and closest points (K, 2, 3), m, of uninflated bodies."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -303,7 +303,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the smallest of two bodies' gaps along a direction at the given samples. Shape (K,), m.
+        """Return the smallest gap of each pair of bodies along a fixed direction over several samples. Shape (K,), m.
 
         The same row must separate the bodies at all samples; otherwise nothing follows for the times between.
         """
@@ -319,7 +319,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Split pairs by the kinds of their hulls; yield each group, the places in `rows`, and indices in the group."""
+        """Group pairs by the kinds of hulls; yield each group, and its pairs' places in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -433,7 +433,7 @@ class Separation:
 
     @property
     def bodies(self) -> tuple[Hull, ...]:
-        """The bodies, in the order of their indices."""
+        """Hulls of all bodies of the declaration, in the order of their indices."""
         return tuple(self.hulls.values())
 
     @property

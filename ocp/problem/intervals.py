@@ -55,7 +55,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 def interpret(
     function: Any, inputs: Sequence[Value], constant: Callable[[float], Value], apply: Callable[..., Value]
 ) -> list[Value]:
-    """Return the entries of the single output of an SX function, evaluated in another arithmetic.
+    """Evaluate an SX function of one output in another arithmetic, such as interval arithmetic; return the entries.
 
     Args:
         function: Function of scalars.
@@ -109,7 +109,7 @@ def _range_of(corners: list[Array]) -> Interval:
 
 
 def bounded_where(known: Any, x: Interval, low: Any = -np.inf, high: Any = np.inf) -> Interval:
-    """Return an interval where a mask says that it is known, elsewhere `low` to `high`, by default unbounded."""
+    """Return the intervals `x` where a mask is true, and the interval from `low` to `high` elsewhere."""
     return Interval(np.where(known, x.low, low), np.where(known, x.high, high))
 
 

@@ -120,7 +120,7 @@ def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most ``count`` random states whose time derivatives are finite, and these. Shape (K, nx) each."""
+    """Return at most ``count`` random states, and their time derivatives, which are finite. Shape (K, nx) each."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))
@@ -133,7 +133,7 @@ def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
-    """Return the bounds of a problem for a solve, relaxed for the end conditions that first integrals make redundant.
+    """Return the bounds of a problem, relaxed for those end conditions that first integrals make redundant.
 
     Of a redundant set the least informative condition is relaxed, of a quaternion its largest entry, up to a leeway.
     """
@@ -150,9 +150,9 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the indices of start and end conditions that first integrals or path equalities imply, with leeways.
+    """Return the start and end conditions that first integrals or path equalities imply, and by how much to relax each.
 
-    The indices are those of the bound table, the leeways the allowed violations.
+    The conditions are indices of the bound table.
     """
     nx, n, places = form.nx, form.nx + form.nu, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])

@@ -18,8 +18,10 @@ The mesh is that of the fraction: all phases have the same number of intervals w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -74,13 +76,14 @@ class Phases(Problem):
         phases: The problems by the names of their phases, in the order of time. They are copied; later declarations in
             them have no effect. Parameters of one name are one parameter, given when it is solved. The parts of a phase
             are called ``PHASE.NAME``, a free duration ``PHASE.duration``.
+        shared: Names of free parameters that the phases have in common. They keep their names.
 
     Raises:
         ProblemError: A phase that is incomplete or has phases itself; parameters of one name and different sizes; a
-            signal, or a moving obstacle, in a phase whose duration is not a number.
+            signal, or a moving obstacle, in a phase whose duration is not a number; a shared state that changes.
     """
 
-    def __init__(self, name: str, phases: Mapping[str, Problem]) -> None:
+    def __init__(self, name: str, phases: Mapping[str, Problem], *, shared: Collection[str] = ()) -> None:
         phases = require.mapping("phases", phases)
         if not phases:
             raise ProblemError(f"problem {name!r}: phases must not be empty", name="phases")
@@ -95,12 +98,66 @@ class Phases(Problem):
         super().__init__(name, ca.MX if any(p.symbols is ca.MX for p in phases.values()) else ca.SX)
         self.horizon(1.0)
         begin, running, terminal = (self.symbols(0.0) for _ in range(3))
+        for own in shared:
+            rates = [problem.declared.dynamics[own] for problem in phases.values() if own in problem.declared.states]
+            if not rates or not all(rate.is_zero() for rate in rates):
+                raise ProblemError(f"problem {name!r}: shared {own!r} is no free parameter of the phases", name=own)
         for phase, problem in phases.items():
-            times = _PhaseInserter(self, phase, problem).declare(begin)
+            times = _PhaseInserter(self, phase, problem, shared).declare(begin)
             self.declared.phases[phase] = times
             begin = begin + times.duration
             running, terminal = running + times.running, terminal + times.terminal
         self.declared.running, self.declared.terminal = running, terminal
+
+    @classmethod
+    def with_costs_at(cls, problem: Problem, costs: Mapping[float, Any]) -> Phases:
+        """Return a problem with additional costs at given times, such as squared deviations from measurements.
+
+        One phase leads from each of these times to the next, ``p0``, ``p1``, ...; the phases are joined, and share the
+        free parameters, which keep their names.
+
+        Args:
+            problem: A problem with a fixed horizon. Its cost and its constraints remain.
+            costs: Scalar expressions of states and parameters, by time, s.
+
+        Raises:
+            ProblemError: The horizon is no number, a time is outside it, a cost is no scalar of the states, or the
+                problem has signals, watched constraints, separations or phases.
+        """
+        checked_problem(problem).check()
+        declared, what = problem.declared, f"problem {problem.name!r}"
+        if declared.signals or declared.watch or declared.apart or declared.phases:
+            raise ProblemError(f"{what}: with costs at times it can have no signals, watches, separations or phases")
+        horizon = declared.horizon
+        assert horizon is not None
+        total = float(constant(horizon.lower)[0]) if horizon.fixed else np.nan
+        if not isinstance(costs, Mapping) or not all(0.0 <= time <= total for time in costs):
+            raise ProblemError(f"{what}: costs at {[*costs]} s do not fit its horizon, {total} s", name="costs")
+        times = np.unique([0.0, *costs, total]).tolist()
+        legs = {f"p{k}": _leg(problem, begin, end, total) for k, (begin, end) in enumerate(pairwise(times))}
+        shared = [name for name, rate in declared.dynamics.items() if rate.is_zero()]
+        whole = cls(problem.name, legs, shared=shared)
+        for before, after in pairwise(legs):
+            whole.join(before, after)
+
+        def at(phase: Phase, expression: Any, begin: bool = False) -> Any:
+            """Return an expression of the original problem, evaluated at the start or the end of a phase."""
+            pairs = [(problem.time, phase.begin if begin else phase.begin + phase.duration), (horizon.symbol, total)]
+            pairs += [(declared.parameters[name].symbol, own.symbol) for name, own in whole.declared.parameters.items()]
+            pairs += [(v.symbol, phase.at_start(n) if begin else phase.at_end(n)) for n, v in declared.states.items()]
+            pairs += [(symbol, whole["p0"].at_start(name)) for name, symbol in declared.at_start.items()]
+            old, new = zip(*pairs, strict=True)
+            return ca.substitute([problem.symbols(expression)], list(old), list(map(problem.symbols, new)))[0]
+
+        last = whole[next(reversed(legs))]
+        for name, end in declared.end.items():
+            whole.end(name, at(last, end.expression), at(last, end.lower), at(last, end.upper), unit=end.unit)
+        cost = 0 if declared.terminal is None else at(last, declared.terminal)
+        for time, own in costs.items():
+            k = times.index(time)
+            cost += at(whole[f"p{max(k - 1, 0)}"], own, begin=k == 0)
+        whole.minimize(terminal=cost)
+        return whole
 
     def __getitem__(self, name: str) -> Phase:
         """Return a phase by its name."""
@@ -108,8 +165,10 @@ class Phases(Problem):
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
-        """Return the states and controls of a phase by their names in that phase."""
-        return parts_of_phase(self[phase].name, {**self.declared.states, **self.declared.controls})
+        """Return the states and controls of a phase by their names in it, and the shared free parameters."""
+        pool = {**self.declared.states, **self.declared.controls}
+        shared = {name: own for name, own in pool.items() if name.partition(".")[0] not in self.declared.phases}
+        return shared | parts_of_phase(self[phase].name, pool)
 
     def join(self, before: str, after: str, states: Mapping[str, Any] | None = None) -> None:
         """Declare that one phase continues another: states of the same name are equal at the junction.
@@ -172,8 +231,8 @@ class Phases(Problem):
 class _PhaseInserter:
     """Helper that declares variables, equations and constraints of a phase in the symbols of the whole problem."""
 
-    def __init__(self, whole: Phases, name: str, problem: Problem) -> None:
-        self.whole, self.name, self.problem = whole, name, problem
+    def __init__(self, whole: Phases, name: str, problem: Problem, shared: Collection[str]) -> None:
+        self.whole, self.name, self.problem, self.shared = whole, name, problem, shared
         self.old: list[Any] = []
         self.new: list[Any] = []
         self.guess_duration: float | None = None  # duration over which guesses are read, s; None if unknown
@@ -196,9 +255,10 @@ class _PhaseInserter:
             track = _of_fraction(signal.function, length)
             self._replace(signal.symbol, whole.signal(self._prefix(signal.name), track))
         for name, symbol in declared.at_start.items():
-            self._replace(symbol, whole.at_start(self._prefix(name)))
+            self._replace(symbol, whole.at_start(name if name in self.shared else self._prefix(name)))
         for name, rate in declared.dynamics.items():
-            whole.declared.dynamics[self._prefix(name)] = duration * self._substitute(rate)
+            if name not in self.shared:
+                whole.declared.dynamics[self._prefix(name)] = duration * self._substitute(rate)
         for kind in ("path", "start", "end", "watch"):
             pool = getattr(whole.declared, kind)
             for name, constraint in getattr(declared, kind).items():
@@ -275,10 +335,13 @@ class _PhaseInserter:
         guess = variable.guess
         if callable(guess):
             guess = None if self.guess_duration is None else _of_fraction(guess, self.guess_duration)
-        declare = self.whole.state if kind == "state" else self.whole.control
-        return declare(
-            self._prefix(variable.name), variable.size, **values, guess=guess, unit=variable.unit, scale=variable.scale
-        )
+        declare, name = self.whole.state if kind == "state" else self.whole.control, self._prefix(variable.name)
+        if variable.name in self.shared:
+            name, states = variable.name, self.whole.declared.states
+            if name in states:
+                return states[name].symbol
+            self.whole.declared.dynamics[name] = self.whole.symbols.zeros(variable.size)
+        return declare(name, variable.size, **values, guess=guess, unit=variable.unit, scale=variable.scale)
 
     def _constraint(self, constraint: Constraint, duration: Any) -> Constraint:
         parts = {part: self._column(getattr(constraint, part)) for part in ("lower", "upper")}
@@ -300,6 +363,42 @@ class _PhaseInserter:
             placements=self._substitute(separation.placements),
             movers={self._prefix(name): size for name, size in separation.movers.items()},
         )
+
+
+def _leg(problem: Problem, begin: float, end: float, total: float) -> Problem:
+    """Return the part of a problem between two times (s), without its terminal cost and its end constraints.
+
+    ``total`` is the problem's horizon, s. Only the first part has given start states, only the last given end states.
+    """
+    leg = copy(problem)
+    own = leg.declared
+    assert own.horizon is not None
+    old, new = [problem.time, own.horizon.symbol], [problem.time + begin, problem.symbols(total)]
+
+    def moved(expression: Any) -> Any:
+        return ca.substitute([problem.symbols(expression)], old, new)[0]
+
+    def guess(value: Any) -> Any:
+        if callable(value):
+            return lambda t: value(t + begin)
+        samples = None if value is None else np.asarray(value, dtype=float)
+        if samples is None or samples.ndim < 2:
+            return value
+        at = np.linspace(0.0, total, len(samples))
+        return lambda t: np.array([np.interp(t + begin, at, column) for column in samples.T])
+
+    for pool in (own.states, own.controls):
+        for name, variable in pool.items():
+            free = {"initial": begin > 0, "terminal": end < total} if pool is own.states else {}
+            ends = {key: problem.symbols(ca.DM.nan(variable.size)) for key, is_free in free.items() if is_free}
+            pool[name] = replace(variable, guess=guess(variable.guess), **ends)
+    own.dynamics = {name: moved(rate) for name, rate in own.dynamics.items()}
+    own.path = {name: replace(rows, expression=moved(rows.expression)) for name, rows in own.path.items()}
+    own.start = own.start if begin == 0 else {}
+    own.running, own.terminal, own.end, own.at_start = moved(0 if own.running is None else own.running), None, {}, {}
+    own.horizon = None
+    leg.horizon(end - begin)
+    return leg
 
 
 def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:

@@ -37,7 +37,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Decorate a method of Problem so that its errors contain the name of what is declared, such as a state."""
+    """Decorate a declaring method of Problem so that its errors name the declared state, constraint or other item."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -55,7 +55,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Decorate a problem builder: its problems store its name and arguments, so that they can be built again."""
+    """Decorate a function that builds problems: each problem stores the builder's name and arguments for a rebuild."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -494,7 +494,7 @@ class Problem:
         known: Sequence[Any] = (),
         during: Value = None,
     ) -> Constraint:
-        """Return a new constraint; its expression may contain what path constraints may, and the ``known`` symbols."""
+        """Return a new constraint, whose expression may contain the symbols of path constraints and ``known`` ones."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         symbols, options = [*self._inner(), *known], {"unit": unit, "tolerance": tolerance, "during": during}
         return self._reader.constraint(kind, name, expression, symbols, bounds=bounds, **options)

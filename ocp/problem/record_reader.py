@@ -162,7 +162,7 @@ def _nonzeros(matrix: Any) -> list[Any]:
 
 
 def _declared_entries(record: Mapping[str, Any]) -> int:
-    """Return the number of entries of all arguments and results that the record of a function declares."""
+    """Return how many matrix entries, zeros included, the arguments and results of a recorded function have."""
     if record["kind"] == "operations":
         return sum(abs(shape[0] * shape[1]) for shape in (*record["inputs"], *record["outputs"]))
     sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
@@ -175,7 +175,7 @@ def _entries(function: Any) -> int:
 
 
 def _call(callee: Any, entries: list[Any]) -> list[Any]:
-    """Call a function with the entries of all its arguments; return the entries of all its results."""
+    """Call a function; its arguments, and its results, are each one flat list of the nonzeros of several matrices."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
     arguments = matrices_from([callee.sparsity_in(k) for k in range(callee.n_in())], entries, ca.MX)
@@ -183,7 +183,7 @@ def _call(callee: Any, entries: list[Any]) -> list[Any]:
 
 
 def _check_index(place: int, count: int, what: str) -> int:
-    """Return an index into `count` items, such as "operand"s; raise ProblemError if there is no such item."""
+    """Return an index; raise ProblemError unless it is below the number `count` of items, such as operands."""
     if not 0 <= place < count:
         raise ProblemError(f"{what} {place} does not exist, there are {count}", name=what, value=place, limit=count)
     return place
@@ -386,7 +386,7 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
 
 
 def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Yield the entries that describe symbols from a record of declarations."""
+    """Yield those parts of a record of declarations that describe symbols."""
     if isinstance(value, dict) and "input" in value:
         yield value
     elif isinstance(value, dict | list):

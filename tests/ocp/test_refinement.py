@@ -29,6 +29,7 @@ from ocp import (
     solve,
 )
 from ocp.refinement import RefinementSettings, split
+from tests.conformance import goddard
 from tests.ocp.problems import (
     SWING,
     LogarithmicRegulator,
@@ -295,7 +296,7 @@ def test_a_switch_gets_a_node_so_that_the_plan_passes(scheme: str) -> None:
 def test_an_overshoot_that_nothing_reduces_is_reported_after_few_rounds() -> None:
     """Control polynomials through points on both sides of a switch overshoot by the same share in any interval."""
     problem, *_ = hurried()
-    settings = RefinementSettings(tighten=False, max_intervals=7)
+    settings = RefinementSettings(max_intervals=7)
     with pytest.warns(RefinementWarning, match=r"at .* of its limit; raise max_intervals") as report:
         solution = refine(problem, MultipleShooting(7, control="linear"), tolerance=1.0, settings=settings)
     assert solution.refinement is not None
@@ -328,6 +329,30 @@ def test_a_plan_with_a_singular_arc_is_feasible_and_no_cost_is_lost(method: Meth
     assert solution.audit().optimal is not False
     assert solution.cost == pytest.approx(1.34408, abs=1e-5)
     assert np.abs(solution.control_interpolant.breaks * 12.0 - 2.4348).min() < 2e-3  # the first switch, from 0 to 1
+
+
+@pytest.mark.filterwarnings("ignore:.*undetermined:ocp.errors.RefinementWarning")
+def test_controls_that_oscillate_on_every_mesh_are_held() -> None:
+    """Goddard's rocket: polynomials of a singular thrust exceed its limits by the same share however fine the mesh."""
+    solution = refine(goddard.build(), Collocation(12), settings=RefinementSettings(limits={"lost": 1e-6}))
+    assert solution.method["control"] == "held"
+    assert solution.audit().feasible
+    assert solution.cost == pytest.approx(goddard.CASE.cost, rel=1e-6)
+
+
+def test_a_boundary_layer_narrower_than_every_first_interval_is_resolved() -> None:
+    """x' = (1 - x) / e from 0: the error of the first interval stays of size 1 until the interval is as narrow as e."""
+    layer = 1e-6
+    problem = Problem("layer")
+    x = problem.state("x", initial=0.0)
+    problem.horizon(1.0)
+    problem.dynamics(x, (1 - x) / layer)
+    problem.minimize()
+    solution = refine(problem, Collocation(6))
+    assert solution.refinement is not None
+    assert solution.refinement.reached
+    at = layer * np.array([0.3, 1.0, 3.0])
+    assert solution.at(at)["x"][:, 0] == pytest.approx(1 - np.exp(-at / layer), abs=1e-5)
 
 
 @pytest.mark.parametrize("ceiling", [0.08, 0.125])

@@ -324,7 +324,7 @@ class Engine:
         future.add_done_callback(lambda _: self._finished.put(number))
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Wait at most some seconds until a job finishes, and return the outcomes of all jobs that have finished."""
+        """Wait until a job finishes, at most ``seconds``, and return the outcomes of all jobs that have finished."""
         self._check_scheduler()
         numbers = []
         with suppress(queue.Empty):

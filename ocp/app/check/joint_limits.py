@@ -25,11 +25,13 @@ from models import FixedBase, Robot
 from models.checks import Array, real
 from ocp.errors import ProblemError, require
 from ocp.motion.result.plan import ENDS, describe_ends
-from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.limits import LIMITED, JointBounds, Limits
 from ocp.tolerances import LIMIT_SHARE
 
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
+CHECKED_LIMITS = tuple(kind for kind in LIMITED if kind != "power")
+"""Limits that can be given to a check."""
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
 """Checked quantities of a joint, and the suffix that turns rad or m into the unit of the quantity."""
 
@@ -358,8 +360,7 @@ def half_digits(values: Array) -> Array:
 def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
     """Combine limits given by joint name with the limits of the robot for all other joints.
 
-    `limits` has for "velocity", "acceleration", "jerk" or "torque" the limits by name of the joint; "" stands for all
-    joints that are not named.
+    `limits` has for names in CHECKED_LIMITS the limits by name of the joint; "" stands for all joints not named.
 
     Raises:
         ProblemError: A joint is unknown, or a limit is not a number above 0.
@@ -406,7 +407,7 @@ def limit_rows(
 
 
 def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
-    """Return the row about the speed of the joints at both ends of a motion; the verdict is OK if they are at rest."""
+    """Return the table row of the largest joint speed at both ends of a motion, with verdict OK if all joints rest."""
     speeds, names = motion.end_speeds(), [robot.joint_names[k] for k in joints]
     units = [robot.joint(name).unit for name in names]
     end, column = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))

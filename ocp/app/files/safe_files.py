@@ -215,6 +215,8 @@ class _Container:
                 raise ValueError("a key must be a text or number")
             if value == "<<":
                 raise ValueError("merged mappings (<<) are not supported; write out their entries")
+            if value in self.value:
+                raise ValueError(f"{value!r} is there twice in a mapping; remove one of the two")
             self.key = value
         else:
             self.value[self.key], self.key = value, _NO_KEY

@@ -20,7 +20,7 @@ from warnings import warn
 import casadi as ca
 import numpy as np
 
-from models import Mesh, ModelError, ModelWarning, MovingObstacle, Robot
+from models import Mesh, ModelError, ModelWarning, MovingObstacle, Robot, checks
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
 from models.shapes.shapes import SHAPE_KINDS, Shape
@@ -74,7 +74,7 @@ class TomlTable:
     def missing(self, name: str, expected: str) -> ProblemError:
         """Return the error about a missing entry, or about an unknown entry with a similar spelling if there is one."""
         unknown = [key for key in self._values if key not in self._read_names]
-        if similar := get_close_matches(name, unknown, n=1, cutoff=0.5):
+        if similar := checks.similar_names(name, unknown, 1):
             return self.error(similar[0], f"unknown entry {similar[0]}; did you mean {name}? It is {expected}")
         table = ".".join(str(part) for part in self.place if isinstance(part, str))
         where = f"in [{table}]" if table else "at the top"
@@ -128,11 +128,7 @@ class TomlTable:
 
     def count(self, name: str, expected: str, default: Any = None) -> Any:
         """Return the entry `name` after checking that it is an integer, 0 or more."""
-
-        def fits(value: Any) -> bool:
-            return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-        return self._read(name, default, expected, fits)
+        return self._read(name, default, expected, lambda value: type(value) is int and value >= 0)
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
         """Return the entry `name` as a vector of `size` numbers, or of any length if `size` is None."""
@@ -150,7 +146,8 @@ class TomlTable:
                 array = floats(value)
             except NOT_NUMBERS:
                 return False
-            return isinstance(value, list) and has_shape(array.shape) and bool(np.isfinite(array).all())
+            flags = any(isinstance(entry, bool) for entry in np.array(value, dtype=object).flat)
+            return isinstance(value, list) and has_shape(array.shape) and bool(np.isfinite(array).all()) and not flags
 
         value = self._read(name, default, expected, fits)
         return value if value is None or value is default else np.array(value, dtype=float)
@@ -240,9 +237,8 @@ class TomlTable:
         """Raise ProblemError if the table has an entry that was not read; it names the line and the known entries."""
         for name in self._values:
             if name not in self._read_names:
-                similar = get_close_matches(name, self._read_names, n=2)
-                known = ", ".join(dict.fromkeys(self._read_names))
-                hint = f"did you mean {' or '.join(similar)}?" if similar else f"known entries: {known}"
+                similar, known = checks.similar_names(name, self._read_names), dict.fromkeys(self._read_names)
+                hint = f"did you mean {' or '.join(similar)}?" if similar else f"known entries: {', '.join(known)}"
                 raise self.error(name, f"unknown entry {name}; {hint}")
 
 
@@ -264,9 +260,10 @@ def read_toml(file: FileName) -> TomlTable:
         match = ERROR_LINE.search(str(error))
         number = min(int(match[1]), len(texts)) if match else len(texts)
         why = ERROR_LINE.split(str(error))[0].strip() or str(error)
-        raise line_error(file, number, texts[number - 1], f"invalid TOML: {why}; write name = value") from error
+        remedy = "remove one of the two" if "twice" in why or "overwrite" in why else "write name = value"
+        raise line_error(file, number, texts[number - 1], f"invalid TOML: {why}; {remedy}") from error
     except (RecursionError, ValueError) as error:  # ValueError: also for numbers with more digits than Python accepts
-        raise ProblemError(f"{file} is not valid TOML: {error}", name="file", value=str(file)) from error
+        raise ProblemError(f"{file} is no TOML or nested too deeply: {error}", name="file", value=str(file)) from error
     return TomlTable(str(file), values, place=(), texts=texts, lines=_places(texts))
 
 
@@ -362,6 +359,8 @@ def obstacles_of(entries: TomlTable, folder: Path, *, moving: bool = False) -> t
     for table in entries.tables("obstacle"):
         velocity = table.vector("velocity", 3, "three numbers, m/s") if moving else None
         obstacle = read_shape(table, folder)
+        lengths = np.hstack([getattr(obstacle, entry, ()) for entry in ("position", "size", "radius")])
+        checks.warn_of_millimetres(f"{entries.file}: a length of an obstacle,", lengths, "obstacle")
         with located_errors(table, "velocity"):
             move = None if velocity is None else partial(ca.mtimes, ca.DM(velocity))
             obstacles.append(obstacle if move is None else MovingObstacle(obstacle, move))
@@ -371,6 +370,7 @@ def obstacles_of(entries: TomlTable, folder: Path, *, moving: bool = False) -> t
 def rotation_of(entries: TomlTable, _: str = "", entry: str = "rpy") -> Array:
     """Return the rotation matrix (3, 3) of an entry with roll, pitch and yaw, rad; the identity if it is missing."""
     angles = entries.vector(entry, 3, "three angles, rad", (0.0, 0.0, 0.0))
+    checks.warn_of_degrees(f"{entries.file}: {entry}", angles)
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
 
@@ -392,7 +392,7 @@ def read_shape(table: TomlTable, folder: Path = Path(), kinds: Iterable[str] = S
     readers = {each.name: SHAPE_ENTRIES[each.name] for each in fields(kind) if each.name in SHAPE_ENTRIES}
     if kind is not Mesh:
         return table.build(kind, readers)
-    file = folder / table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
+    file = folder / table.text("file", "an STL, OBJ or DAE file", REQUIRED)
     return table.build(kind, readers | {"position": POSITION[:3]}, file=file)
 
 

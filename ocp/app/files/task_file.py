@@ -15,12 +15,12 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
+from warnings import warn
 
 import numpy as np
 
 import models
-from models import FreeFloating, Machine, Robot, SmoothPath
-from models.checks import warn_of_millimetres
+from models import FreeFloating, Machine, ModelWarning, Robot, SmoothPath, checks
 from models.machines.standing import tip_spring
 from ocp.app.files import settings
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
@@ -33,8 +33,8 @@ from ocp.motion.builders.standing.stances import Steps, walk
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.result.margin import checked_uncertainty
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
-from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
+from ocp.motion.tasks.goals import PER_JOINT, TERMS, Cost, Goal, Scene, Start, Waypoints
+from ocp.motion.tasks.limits import LIMITED, Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import ramp_limits
 
@@ -169,11 +169,7 @@ ZMP_RULES: Readers = {
 }
 LIMITS: Readers = {
     "joints": (lambda entries, name: entries.flag("positions", True),),
-    "velocity": (joint_values, np.inf, (f"a number above 0, rad/s or m/s, {BY_JOINT}", 0.0)),
-    "acceleration": (joint_values, np.inf, (f"a number above 0, rad/s^2 or m/s^2, {BY_JOINT}", 0.0)),
-    "jerk": (joint_values, np.inf, (f"a number above 0, rad/s^3 or m/s^3, {BY_JOINT}", 0.0)),
-    "torque": (joint_values, np.inf, (f"a number above 0, N m or N, {BY_JOINT}", 0.0)),
-    "power": (joint_values, np.inf, (f"a number above 0, W, {BY_JOINT}", 0.0)),
+    **{kind: (joint_values, np.inf, (f"a number above 0, {unit}, {BY_JOINT}", 0.0)) for kind, unit in LIMITED.items()},
     "vertical_force": (TomlTable.positive, "N"),
     "friction": (TomlTable.positive, "the friction coefficient of the ground"),
     "zmp": (_zmp_rule,),
@@ -181,8 +177,8 @@ LIMITS: Readers = {
 }
 COST: Readers = {
     "weights": (joint_values, 1.0, (f"a number above 0, {BY_JOINT}", 0.0)),
-    **dict.fromkeys(("effort", "acceleration"), (joint_values, 0.0, (WEIGHT, -1e-300))),
-    **dict.fromkeys(("velocity", "time", "length", "energy", "jerk", "turning"), (TomlTable.nonnegative, "a weight")),
+    **dict.fromkeys(TERMS, (TomlTable.nonnegative, "a weight")),
+    **dict.fromkeys(PER_JOINT, (joint_values, 0.0, (WEIGHT, -1e-300))),
 }
 SEARCH: Readers = {
     "cyclic": (TomlTable.flag,),
@@ -367,7 +363,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
         return _located(entries, "file", poses.smooth, deviation)  # type: ignore[no-any-return]
     if len(corners) < 2:
         raise entries.error("points", f"points must be {words}")
-    warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
+    checks.warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
     return _located(entries, "points", partial(models.smooth, deviation=deviation), models.Path.through(corners))
 
 
@@ -376,7 +372,11 @@ def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
     name = entries.text("file", "the name of a file of waypoints", REQUIRED)
     if not (folder / name).is_file():
         raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
-    return _located(entries, "file", read_waypoints, folder / name)
+    poses = _located(entries, "file", read_waypoints, folder / name)
+    if poses.ignored:
+        words = f"{folder / name}: unknown columns {', '.join(poses.ignored)} are ignored"
+        warn(ModelWarning(words, name=name), stacklevel=2)
+    return poses
 
 
 def _goal(entries: TomlTable, folder: Path, machine: Machine) -> Goal:
@@ -391,8 +391,7 @@ def _waypoints(entries: TomlTable, folder: Path, machine: Machine) -> Waypoints:
     """Read the table [waypoints] of a task file and return the waypoints of the planner."""
     poses = _read_waypoints(entries, folder)
     if poses.orientations is None or poses.free_roll:
-        words = "waypoints without a path need whole orientations: quaternions in columns qw, qx, qy, qz"
-        raise entries.error("file", words)
+        raise entries.error("file", "[waypoints] need whole orientations: quaternions in columns qw, qx, qy, qz")
     return entries.build(partial(Waypoints, poses.positions, poses.orientations), WAYPOINTS)
 
 
@@ -401,8 +400,7 @@ def _walk(entries: TomlTable, folder: Path, machine: Machine) -> Steps:
     feet, start, steps = {}, {}, []
 
     def foothold(table: TomlTable) -> models.Foothold:
-        place = table.vector("at", 4, "four numbers: x, y (m), heading (rad), height (m)", REQUIRED)
-        return models.Foothold.level(*place)
+        return models.Foothold.level(*table.vector("at", 4, "four numbers: x, y, heading, height; m, rad", REQUIRED))
 
     for name, table in entries.tables_by_name("feet").items():
         sole = table.vector("sole", 4, "four numbers, m: least and greatest x, least and greatest y")

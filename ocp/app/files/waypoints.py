@@ -299,7 +299,10 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
         missing = [name for name in kind if name not in names]
         if missing and (kind == POSITION or len(missing) < len(kind)):
             message = f"{file}: no column {', '.join(missing)} among {', '.join(repr(cell) for cell in head)}"
-            raise ProblemError(f"{message}; name it in the header or with columns=", name=missing[0], value=tuple(head))
+            remedy = "name it in the header or with columns="
+            if head and re.fullmatch(r"[GMNO]\d+.*", head[0]):
+                remedy = "is it G-code? Read it in Python: ocp.app.files.read_gcode"
+            raise ProblemError(f"{message}; {remedy}", name=missing[0], value=tuple(head))
     return names, scales, tuple(ignored)
 
 

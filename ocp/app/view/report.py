@@ -32,7 +32,8 @@ from ocp.app.view.appearance import (
 )
 from ocp.app.view.rendering import PICTURE_STYLE, Camera, Floor, Layer, encode_png, parts_in_world, render, tube
 from ocp.motion.plan import Plan
-from ocp.motion.tasks.goals import Scene
+from ocp.motion.result.solved_plan import SolvedPlan
+from ocp.motion.tasks.goals import Cost, Scene
 from ocp.motion.tasks.limits import JointBounds, Limits
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -187,6 +188,9 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
+    request = plan.request if isinstance(plan, SolvedPlan) else None
+    if request is not None and isinstance(request.cost, Cost):
+        cost += f", of {' and '.join(request.cost.terms)}"
     count = [f"{len(plan.candidates)} candidates"] if len(plan.candidates) > 1 else []
     return Report(
         title,

@@ -288,7 +288,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
 
 
 def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
-    """Return a motion along a joint path (M, n) that stops at each corner, slowed down to the torque limits."""
+    """Return a joint motion along a polyline (M, n) that rests at each corner and satisfies the torque limits."""
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
     parts = [torques.slow_down(_straight_motion(first, last - first, bounds)) for first, last in pairwise(corners)]
@@ -298,7 +298,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the least durations, s, (K,) of straight rest-to-rest motions by (K, n) without torque limits."""
+    """Return the least durations, s, (K,) of straight rest-to-rest displacements (K, n) under all limits but torque."""
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 

@@ -43,7 +43,7 @@ from ocp.motion.tasks.checks import (
     rates_at_rest,
 )
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.goals import Cost
+from ocp.motion.tasks.goals import PER_JOINT, Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
@@ -139,7 +139,7 @@ class Actuation:
 
     cost: Cost | None = None  # weights of all terms but the time; None for half the squared rates
     rests: tuple[bool, bool] = (False, False)  # whether the joints rest at the start and at the end
-    end_rows: Any = None  # rows (k, n) of the velocities that are zero at an end at rest; None for all
+    rest_rows: tuple[Any, Any] = (None, None)  # rows (k, n) of the motion that is zero at rest at each end; None: all
     smoothing: float = 1e-3  # duration in which a control passes from limit to limit, as a share of the horizon
 
 
@@ -162,18 +162,20 @@ def declare_actuators(
     """
     (base, joints), robot, n = place, machine.robot, machine.joint_size
     cost = Cost() if actuation.cost is None else actuation.cost
-    smoothing, (initial, terminal) = actuation.smoothing * horizon, (0.0 if rest else None for rest in actuation.rests)
+    smoothing, (starts, ends) = actuation.smoothing * horizon, actuation.rests
+    start_rows, end_rows = (np.eye(n) if rows is None else np.asarray(rows) for rows in actuation.rest_rows)
     limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": robot.unit("/s")}
-    if terminal is None or actuation.end_rows is None:
-        rates = problem.state(f"velocities{suffix}", n, initial=initial, terminal=terminal, **limits)
-    else:
-        rates = problem.state(f"velocities{suffix}", n, initial=initial, **limits)
-        if len(actuation.end_rows):
-            problem.end(f"rest{suffix}", ca.mtimes(ca.DM(actuation.end_rows), rates), 0, 0, unit=robot.unit("/s")[0])
+    rates = problem.state(f"velocities{suffix}", n, initial=0.0 if starts else None, **limits)
+    if ends and len(end_rows):
+        problem.end(f"rest{suffix}", ca.mtimes(ca.DM(end_rows), rates), 0, 0)
     limits = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
     jerks: Any = ca.DM(0, 1)
     if np.isfinite(bounds.jerk).any() or cost.jerk:
         second = problem.state(f"accelerations{suffix}", n, **limits)
+        if starts and len(start_rows):
+            problem.start(f"start acceleration{suffix}", ca.mtimes(ca.DM(start_rows), second), 0, 0)
+        if ends and len(end_rows):
+            problem.end(f"end acceleration{suffix}", ca.mtimes(ca.DM(end_rows), second), 0, 0)
         jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
         problem.dynamics(second, pace * jerks)
         smooth = smoothing**2 * ca.sumsqr(jerks)
@@ -193,15 +195,14 @@ def declare_actuators(
 
 def weights_torques(cost: Cost) -> bool:
     """Return whether a cost depends on joint torques."""
-    return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
+    return bool({"effort", "energy"} & set(cost.terms))
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
     """Return the cost per second of a motion, without the terms of duration and positive power, as an expression."""
     (base, joints, rates, second), n = motion, machine.joint_size
-    running = ca.dot(
-        ca.DM(require.broadcast("cost: acceleration", cost.acceleration, n, "joints", sign="nonnegative")), second**2
-    )
+    effort, acceleration = (require.broadcast(f"cost: {name}", getattr(cost, name), n, "joints") for name in PER_JOINT)
+    running = ca.dot(ca.DM(acceleration), second**2)
     if cost.velocity:
         running += ca.dot(ca.DM(cost.joint_weights(n)), rates**2) / 2
     if cost.length:
@@ -211,10 +212,8 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
     if cost.turning and isinstance(machine, FreeFloating):
         spin = [k for k, row in enumerate(machine.twist_rows) if row < 3]
         running += cost.turning * ca.sumsqr(machine.base_twist(base, joints, rates)[spin])
-    if np.any(np.asarray(cost.effort)):
-        running += ca.dot(
-            ca.DM(require.broadcast("cost: effort", cost.effort, n, "joints", sign="nonnegative")), torques**2
-        )
+    if effort.any():
+        running += ca.dot(ca.DM(effort), torques**2)
     return running
 
 

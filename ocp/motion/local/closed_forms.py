@@ -95,7 +95,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Yield poses near the given poses, in pairs on opposite sides, at which missing solutions may be found."""
+        """Yield poses displaced from given poses to two opposite sides, at which missing solutions may be found."""
         rng = np.random.default_rng(FORMS.seed)
         for _ in range(FORMS.pairs):
             turn, shift = FORMS.distance * rng.normal(size=(2, 3))
@@ -132,7 +132,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the loop closure equation of the free joints, in which the meeting or parallel axes come last."""
+        """Return the loop closure equation of the non-redundant joints; its last axes intersect or are parallel."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -151,7 +151,7 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Return IK solutions, whose joint positions are listed in `order`, as one column in the order of the chain."""
+        """Stack the joint positions of IK solutions, listed in joint order `order`, in one column in chain order."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property

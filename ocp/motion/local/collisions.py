@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from models import CollisionScene, Machine
 from models.checks import Array
 from ocp.errors import ProblemError, require
-from ocp.problem.hulls import BodyPairs, Frames, Hull, frames_of
+from ocp.problem.hulls import WORLD, BodyPairs, Frames, Hull, frames_of
 from ocp.problem.values import Sampler
 from ocp.tolerances import STANDSTILL
 
@@ -83,13 +83,8 @@ def near_pairs(
         Configuration, among (M, n) of a fixed base, and pair of each; its distance beyond the clearance, m, shape (K,);
             and the gradient of this distance, or 0 without `gradients`, shape (K, n).
     """
-    (placements, bodies), n, near = prepared_pairs(scene), joints.shape[1], scene.clearance + reach
-
-    def frames_at(configurations: Array) -> Frames:
-        count = len(configurations)
-        return frames_of(placements(np.zeros((count, 0)), configurations, np.zeros((count, 1)))[0])
-
-    frames = frames_at(joints)
+    bodies, n, near = prepared_pairs(scene)[1], joints.shape[1], scene.clearance + reach
+    frames = _fixed_base_frames(scene, joints)
     at, pair = np.nonzero(bodies.all_balls(frames) < near)
     gap = bodies.gaps(frames, at, pair, near)
     at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
@@ -100,9 +95,76 @@ def near_pairs(
         facing = bodies.nearest(frames, at, pair)[0]
         gap_now = bodies.chords(facing, frames, (at,))
         for joint, change in enumerate(SLIDING.difference * np.eye(n)):
-            moved = bodies.chords(facing, frames_at(joints[rows] + change), (index,))
+            moved = bodies.chords(facing, _fixed_base_frames(scene, joints[rows] + change), (index,))
             gradient[:, joint] = (moved - gap_now) / SLIDING.difference
     return at, pair, gap - scene.clearance, gradient
+
+
+def largest_changes(
+    scene: CollisionScene,
+    joints: Array,
+    at: NDArray[np.intp],
+    pair: NDArray[np.intp],
+    *,
+    box: tuple[Array, Array, Array],
+) -> Array:
+    """Return upper bounds of how much the distances of pairs change within boxes of joint displacements, m. Shape (K,).
+
+    A displacement is d = T . t + e with |t_a| <= reach_a and |e_j| <= rest_j. A point p of a body then moves, relative
+    to the other body, by no more than
+
+        sum of reach_a |dp/dt_a| + lever . rest + (turn . |d|) (lever . |d|),
+
+    with the levers and turns of the scene; the last term is half the bound of p'' in :mod:`ocp.problem.hulls`. The
+    points are those of the cores, whose distances are greater by the radii of the bodies. Unlike lever . |d|, the first
+    term is 0 for a body that the self-motion T leaves in place. The levers alone bound the change where the penetration
+    depth is an estimate, which may be too large.
+
+    Args:
+        joints: Middle configurations of a machine on a fixed base. Shape (M, n).
+        at, pair: Index of the configuration and of the pair of each of K distances.
+        box: T, (M, n, r), the reach, (M, r), and the rest, (M, n).
+    """
+    tangents, reach, rest = box
+    hulls, levers, step = [*scene_hulls(scene).values()], scene.levers, SLIDING.difference
+    spans = (np.abs(tangents) * reach[:, None]).sum(axis=2)[at] + rest[at]
+    arms, turns = levers.joints[pair], levers.joint_turns[pair]
+    changes = (arms * rest[at]).sum(axis=1) + (turns * spans).sum(axis=1) * (arms * spans).sum(axis=1)
+    rows, index = np.unique(at, return_inverse=True)
+    for axis in range(tangents.shape[2]):
+        shift = step * tangents[rows, :, axis]
+        ends = [_fixed_base_frames(scene, joints[rows] + sign * shift) for sign in (1.0, -1.0)]
+        for number in np.unique(pair).tolist():
+            chosen = np.flatnonzero(pair == number)
+            *bodies, observer = scene.pairs[number].tolist()
+            if number in scene.covers or not _has_exact_depth(*(hulls[body] for body in bodies)):
+                changes[chosen] = np.inf
+                continue
+            for hull in (hulls[body] for body in bodies if hulls[body].frame not in (observer, WORLD)):
+                poses = [_relative_pose(each, index[chosen], hull.frame, observer) for each in ends]
+                rotation, speed = ((first - last) / (2 * step) for first, last in zip(*poses, strict=True))
+                moved = hull.core @ rotation.transpose(0, 2, 1) + speed[:, None]
+                fastest = np.linalg.norm(moved, axis=2).max(axis=1)
+                changes[chosen] += reach[at[chosen], axis] * fastest
+    return np.asarray(np.minimum(changes, (arms * spans).sum(axis=1)))
+
+
+def _has_exact_depth(first: Hull, second: Hull) -> bool:
+    """Return whether the penetration depth of two bodies is exact: of segments and boxes, and of half-spaces."""
+    return bool(first.normal.size or second.normal.size) or max(first.kind, second.kind) <= 2
+
+
+def _relative_pose(frames: Frames, at: NDArray[np.intp], frame: int, observer: int) -> tuple[Array, Array]:
+    """Return rotations (K, 3, 3) and positions (K, 3) of a frame at given samples, observed from another frame."""
+    turn = frames.rotations[at, observer].transpose(0, 2, 1)
+    offset = frames.positions[at, frame] - frames.positions[at, observer]
+    return turn @ frames.rotations[at, frame], (turn @ offset[:, :, None])[:, :, 0]
+
+
+def _fixed_base_frames(scene: CollisionScene, joints: Array) -> Frames:
+    """Return the frames of the bodies, among fixed obstacles, in configurations (M, n) of a machine on a fixed base."""
+    count = len(joints)
+    return frames_of(prepared_pairs(scene)[0](np.zeros((count, 0)), joints, np.zeros((count, 1)))[0])
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:

@@ -10,11 +10,13 @@ of the squared rates is then the guess of one motion, and the lowest of their co
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from models import Robot
 from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.direct.guess import Samples
@@ -29,16 +31,26 @@ from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest
 from ocp.motion.tasks.goals import Cost
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import LIMITED, JointBounds, Limits
+from ocp.motion.tasks.speed_profile import ramp_time
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
-from ocp.tolerances import RESOLVED_SHARE
+from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
 
-ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
+
+class _Demand(NamedTuple):
+    """Largest demand on an actuator: ratio to its limit, limited quantity, and a `Reason` that describes the demand."""
+
+    ratio: float = 0.0
+    quantity: str = ""
+    reason: Reason | None = None
+
+
+ACTUATOR_LIMITS = tuple(kind for kind in LIMITED if kind != "velocity")
 
 
 def limits_actuators(limits: Limits) -> bool:
-    """Return whether the acceleration, jerk, torque or power of joints is limited."""
+    """Return whether a quantity of the joints other than their positions and velocities is limited."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
@@ -48,8 +60,9 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return a copy of the limits of a motion without those of acceleration, jerk, torque and power."""
-    return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
+    """Return a copy of the limits of a motion without those in `ACTUATOR_LIMITS`."""
+    none: dict[str, Any] = dict.fromkeys(ACTUATOR_LIMITS)
+    return replace(limits, **none)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
@@ -81,32 +94,76 @@ def _moving_joints(plan: SolvedPlan) -> tuple[Any, Array, tuple[Array, ...]]:
 
 
 def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return which actuator a plan demands most of, relative to its limit; None if no actuator is limited.
+    """Return the reason that describes a plan's largest demand on an actuator, relative to its limit, or None.
 
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.
     """
     machine, t, samples = _moving_joints(plan)
-    bounds = limits.bounds(machine)
     symbols = [ca.SX.sym("v", values.shape[1]) for values in samples]
     torques_at = ca.Function("torques", symbols, [joint_torques(checked_motors("limits", machine), (*symbols,))])
     torques = np.array(torques_at.map(len(t))(*(values.T for values in samples))).T
     _, _, rates, accelerations = samples
-    largest, demand = -np.inf, None
-    for quantity, values, most_allowed in (
-        ("acceleration", np.abs(accelerations), bounds.acceleration),
-        ("torque", np.abs(torques), bounds.torque),
-        ("power", torques * rates, bounds.power),
-    ):
-        ratios = values / most_allowed
-        row, index = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-        if np.isfinite(most_allowed).any() and ratios[row, index] > largest:
-            largest, joint = ratios[row, index], machine.robot.moving_joints[index]
-            unit = {"acceleration": f"{joint.unit}/s^2", "torque": joint.effort_unit, "power": "W"}[quantity]
-            time, value, allowed = float(t[row]), float(values[row, index]), float(most_allowed[index])
-            words = f"{quantity} of {joint.name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
-            demand = Reason(Rejection.ACTUATORS, words, joint.name, value, allowed, time)
-    return demand
+    demands = {"acceleration": accelerations, "torque": torques, "power": np.maximum(torques * rates, 0.0)}
+    bounds = limits.bounds(machine)
+    each = [_demand(machine.robot, *of, t, bounds) for of in demands.items()]
+    return max(each, key=attrgetter("ratio")).reason
+
+
+def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> _Demand:
+    """Return the largest demand on joints, relative to limits, by values (M, n) of a quantity; 0 without limits."""
+    most_allowed = getattr(bounds, quantity)
+    if not np.isfinite(most_allowed).any():
+        return _Demand()
+    row, index = np.unravel_index(int(np.argmax(np.abs(values) / most_allowed)), values.shape)
+    joint = robot.moving_joints[index]
+    units = {"acceleration": f"{joint.unit}/s^2", "jerk": f"{joint.unit}/s^3", "torque": joint.effort_unit}
+    time, value, allowed = float(t[row]), float(abs(values[row, index])), float(most_allowed[index])
+    words = f"{quantity} of {joint.name!r} is {value:.4g} {units.get(quantity, 'W')} at {time:.4g} s"
+    details = joint.name, value, allowed, time
+    reason = Reason(Rejection.ACTUATORS, f"{words}, {allowed:.4g} allowed", *details)
+    return _Demand(value / allowed, quantity, reason)
+
+
+def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
+    """Return the largest demand of tasks beyond a limit (of acceleration, jerk, or torque at rest) of a joint that no
+    self-motion moves, on the branch of a plan; None if no limit is exceeded.
+
+    A joint that no self-motion moves at a random configuration is not moved at almost all configurations: the tasks
+    determine its motion. Divided differences of its velocity are values of its acceleration and jerk (mean value
+    theorem). In the same way, the tasks determine a gravity torque that no self-motion changes. Returns None on a
+    floating base, with a free horizon, and if there is no such joint.
+    """
+    machine, demands = request.machine, list[_Demand]()
+    if machine.base_size or request.time_cost is not None:
+        return None
+    configuration = np.random.default_rng(0).normal(size=machine.joint_size)
+    bounds, q, zeros = limits.bounds(machine), ca.SX.sym("q", machine.joint_size), np.zeros(machine.joint_size)
+    gravity = joint_torques(checked_motors("limits", machine), ((), q, zeros, zeros))
+    gravity_at = ca.Function("gravity", [q], [gravity, ca.jacobian(gravity, q)])
+    for stretch in (stretch for stretch in request.stretches if stretch.equations is not None):
+        equations: Any = stretch.equations
+        free = _null_rows(np.array(equations.jacobian_function(configuration, ())))
+        determined = ~(np.abs(free) > ROUNDING_SHARE).any(axis=0)
+        ends = np.array([stretch.begin, *stretch.breaks, stretch.end])
+        t = np.interp(np.arange(4 * len(ends) - 3) / 4, np.arange(len(ends)), ends)
+        joints = unlimited.sampled(t).joints[:, [name not in unlimited.held for name in unlimited.names]]
+        targets = equations.target_function().map(len(t))(t[None, :])
+        jacobians, right, *_ = equations.function.map(len(t))(np.zeros((0, len(t))), joints.T, targets)
+        rows = np.array(jacobians).reshape(equations.size, len(t), -1).transpose(1, 0, 2)
+        rates = (np.linalg.pinv(rows) @ np.array(right).reshape(equations.size, len(t), 1).transpose(1, 0, 2))[:, :, 0]
+        accelerations = np.diff(rates, axis=0) / np.diff(t)[:, None]
+        jerks = 2 * np.diff(accelerations, axis=0) / (t[2:] - t[:-2])[:, None]
+        slopes = gravity_at(configuration)[1].full()
+        fixed = (np.abs(slopes @ free.T) <= ROUNDING_SHARE * np.abs(slopes).max()).all(axis=1)
+        static = gravity_at.map(2)(joints[[0, -1]].T)[0].full().T
+        holds = [stretch is request.stretches[-k] and rests for k, rests in enumerate(request.rests)]
+        at_rest = np.array(holds)[:, None] * fixed * static
+        of_kinds = ("torque", at_rest, t[[0, -1]]), ("acceleration", determined * accelerations, t)
+        for of in (*of_kinds, ("jerk", determined * jerks, t[1:])):
+            demands.append(_demand(machine.robot, *of, bounds))
+    largest = max(demands, key=attrgetter("ratio"), default=_Demand())
+    return largest if largest.ratio > 1.0 + LIMIT_SHARE else None
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
@@ -121,6 +178,13 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
         SolveError: No motion was found. Names the joint, the time, the demand without the limit, and the limit.
     """
     limits = request.actuator_limits or request.limits
+    if (demand := demand_of_tasks(request, unlimited, limits)) is not None:
+        words = "the tasks determine the motion of this joint: lower the speed, acceleration or jerk of the tasks"
+        if demand.quantity == "torque":
+            words = "the arm must hold itself at rest there: reduce its load, or move the tasks"
+        error = SolveError(words)
+        _add_demand(error, demand.reason)
+        raise error
     first = request.stretches[0]
     if request.start is None:
         # a joint that started elsewhere moves separated bodies: its start stays free
@@ -128,12 +192,14 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
         start = np.where(np.isclose(initial, start, rtol=0.0), start, np.nan)
 
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
-    breaks = np.unique(np.concatenate([np.zeros(0), *fractions])).tolist()
+    rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
+    ramps = _ramps(request, unlimited, limits, rest_rows)
+    breaks = np.unique(np.concatenate([ramps, *fractions])).tolist()
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            actuation = Actuation(request.cost, request.rests, _undetermined_rows(request, unlimited))
+            actuation = Actuation(request.cost, request.rests, rest_rows)
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited)
             return motion.problem
@@ -154,19 +220,40 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     return solution
 
 
-def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
-    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the end."""
-    last = request.stretches[-1]
-    if last.equations is None:
+def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
+    """Return the times, as fractions of the horizon, of the middles and ends of the fastest ramps between rest and the
+    self-motion at the ends of a plan. Limited jerks switch at these times.
+    """
+    horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
+    rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
+    fastest = [np.minimum(most, 1.0 / STANDSTILL).tolist() for most in (bounds.acceleration, bounds.jerk)]
+    for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
+        speeds = np.abs(rows.T @ (rows @ rates[k, [name not in unlimited.held for name in unlimited.names]]))
+        share = rests * max(map(ramp_time, speeds.tolist(), *fastest)) / horizon
+        shares += [abs(k - place) for place in (share / 2, share) if RESOLVED_SHARE < place < 0.5]
+    return np.array(shares)
+
+
+def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan, end: int) -> Array:
+    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the start, if
+    `end` is 0, or at the end, if it is -1.
+    """
+    stretch = request.stretches[end]
+    if stretch.equations is None:
         return np.eye(request.machine.joint_size)
-    names = [f"{kind}{last.suffix}" for kind in ("base", "joints")]
-    base, joints = (unlimited.solution[name][-1] if name in unlimited.solution.states else () for name in names)
-    _, sizes, rows = np.linalg.svd(np.array(last.equations.jacobian_function(joints, base)))
+    names = [f"{kind}{stretch.suffix}" for kind in ("base", "joints")]
+    base, joints = (unlimited.solution[name][end] if name in unlimited.solution.states else () for name in names)
+    return _null_rows(np.array(stretch.equations.jacobian_function(joints, base)))
+
+
+def _null_rows(jacobian: Array) -> Array:
+    """Return orthonormal rows (k, n) that span the null space of a Jacobian (m, n)."""
+    _, sizes, rows = np.linalg.svd(jacobian)
     return np.asarray(rows[int((sizes > RESOLVED_SHARE * sizes.max(initial=0.0)).sum()) :])
 
 
 def _add_demand(error: SolveError, demand: Reason | None) -> None:
-    """Add to the text of an error what a motion demands of the actuators if it ignores their limits."""
+    """Add to the text of an error the largest demand on an actuator of a motion that ignores the actuator limits."""
     words = "no motion within the actuator limits was found"
     if demand is not None:
         words += f"; without them, {demand.detail}"

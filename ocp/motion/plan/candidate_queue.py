@@ -181,7 +181,7 @@ class CandidateQueue:
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> list[Candidate] | None:
-        """Return the candidates of the motion to which a candidate converged on its first mesh; None for a new one."""
+        """Return the candidates that converged to a candidate's motion on its first mesh; None for a new motion."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(first.seed is candidate.seed for first, *_ in self._motions):
@@ -219,7 +219,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost, and of equal path if costlier ones are kept, has passed."""
+        """Return whether a candidate of equal cost (and path, if costlier ones are kept) has passed its audit."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.total - c.total) <= self.settings.same_cost * c.total]
         if not self._always_costlier or candidate.solution is None:
@@ -247,7 +247,7 @@ class CandidateQueue:
             self._push(advanced)
 
     def _resume_duplicates(self, rejected: Candidate) -> None:
-        """Queue the duplicates again that waited for the result of a candidate, which was now rejected."""
+        """Queue again the duplicates that waited for the result of a candidate which was now rejected."""
         self._push_turned(rejected)
         same = [motion for motion in self._motions if motion[0].seed is rejected.seed]
         self._motions = [motion for motion in self._motions if motion[0].seed is not rejected.seed]

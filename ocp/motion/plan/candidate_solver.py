@@ -121,7 +121,7 @@ class CandidateSolver(Solver):
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return why a candidate failed: what its guess or, if tasks are relaxed, the last iterate violates."""
+        """Return why a candidate failed: violations by its guess or, if tasks are relaxed, by its last iterate."""
         if not candidate.seed.local:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
         if candidate.solution is not None and candidate.seed.relaxed:
@@ -410,7 +410,7 @@ class CandidateSolver(Solver):
     # ---- collisions --------------------------------------------------------------------------------------------------
 
     def collisions(self, candidate: Candidate) -> list[Collision]:
-        """Return the collisions of a candidate between bodies that are not yet separated, in order of severity."""
+        """Return the collisions of a candidate between bodies without a separation constraint, in order of severity."""
         constraints, solution = candidate.constraints, candidate.solution
         if constraints is None or solution is None:
             return []

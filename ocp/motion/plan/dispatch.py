@@ -211,8 +211,11 @@ def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, optio
         try:
             result = _plan(machine, tasks, horizon, scene, replace(options, limits=own))
         except SolveError as error:
-            words = f"obstacles enlarged by {reserve['distance']:g} m and torque limits {tightened.tolist()} leave "
-            error.args = (f"{words}room for the uncertainties, but {error}",)
+            stricter = [f"obstacles enlarged by {reserve['distance']:g} m"] if reserve["distance"] else []
+            stricter += [] if tightened is torque else [f"torque limits of {np.round(tightened, 4).tolist()}"]
+            covered = ", ".join(f"{name} {size:g}" for name, size in sizes.items())
+            words = f"no motion covers {covered}: with {' and '.join(stricter) or 'the limits as they are'}, "
+            error.args = (f"{words}{error}",)
             raise
         parts = [piece.plan for piece in result.pieces] if isinstance(result, ConsecutivePlans) else [result]
         for problem in (part.solution.problem for part in parts):
@@ -285,8 +288,8 @@ def plan_problem(
     """Declare, but do not solve, the optimal control problem of `plan`; no start configurations are searched for.
 
     The clearance of the scene is proven by the audit of a solution, but no pair of bodies is separated yet, see
-    `ClearanceConstraints.with_pairs`. A goal needs joint positions here, not a pose. Limits of actuators beside tip
-    tasks, and a free horizon for them, belong to `plan`.
+    `ClearanceConstraints.with_pairs`. A goal needs joint positions here, not a pose. Beside tip tasks, limits of
+    actuators, a free horizon, and all terms of the cost but the squared joint velocities belong to `plan`.
 
     Args:
         machine, tasks, horizon, start, cyclic, cost, limits, scene: As in `ocp.plan`.
@@ -319,8 +322,12 @@ def plan_problem(
         setup = StandingSetup(external=wrenches, clearance_constraints=constraints)
         options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
-    weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)
+    own = Cost() if own is None else require.instance("cost", own, Cost)
+    if own.terms != ("velocity",):
+        words = f"cost: plan_problem weights the squared joint velocities of tip tasks alone, not {own}; use plan"
+        raise ProblemError(words, name="cost", value=own)
     own_setup = VelocitySetup(start_base=base, clearance_constraints=constraints)
+    weights = own.joint_weights(machine.joint_size)
     options = {"start": joints, "cyclic": cyclic, "weights": weights, "limits": limits, "setup": own_setup}
     return minimum_velocity_problem(machine, goals, horizon, **options)
 

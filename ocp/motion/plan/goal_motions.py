@@ -118,7 +118,7 @@ class GoalRequest:
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
-        """Return the context that limits the time, s: wall time if the request limits it, else processor time."""
+        """Return a context manager that limits wall time, s, if the request has a time limit, else processor time."""
         return time_limited(seconds, processor=self.time_limit is None)
 
 
@@ -143,7 +143,7 @@ class GoalTask:
 
     @property
     def moves(self) -> bool:
-        """Whether the joints need not be at rest at the start or at the end of the motion."""
+        """Whether the joints may move at the start or at the end of the motion."""
         return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
 
     @property
@@ -303,7 +303,7 @@ class _PathProblem:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping_motion(self) -> Candidate:
-        """Return the audited motion that stops at the path's corners, slowed down to the horizon if that is fixed."""
+        """Return the audited motion that stops at all corners of the path, extended to the horizon if that is fixed."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or task.moves:
             words = "motions with stops are not offered where energy is weighted, or the machine moves at an end"

@@ -93,7 +93,7 @@ def _find_candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Return a checked request, with goals shifted towards the start by full turns of the unlimited joints."""
+    """Return a checked request, with goals shifted towards the start by full turns of the periodic joints."""
     machine = require.instance("machine", request.machine, FixedBase)
     # the problem that is declared warns of unknown limits
     bounds = require.instance("limits", request.limits, Limits).bounds(machine)
@@ -168,7 +168,7 @@ def _collision_error(scene: Any, name: str, collision: Any) -> ProblemError:
 
 
 def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
-    """Return a goal with its unlimited joints shifted by full turns within limits, the nearest to the start first."""
+    """Return configurations that differ from a goal by full turns of periodic joints, the nearest to `start` first."""
     nearest = start + space.difference(goal, start)
     shifts = []
     for joint in range(len(goal)):

@@ -121,7 +121,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates whose guesses are tracked motions, those that satisfy the tasks first, then sorted by cost.
+    """Return candidates whose guesses are local motions; those that satisfy the tasks come first, sorted by cost.
 
     The cost includes that of the approach from the configuration `near` of the request.
 
@@ -209,7 +209,7 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
 
 def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
-    """Solve the motions of the search; return whether a plan is so good that none of them promises a lower cost.
+    """Solve the motions of a global search; return whether a plan costs so little that none of them promises less.
 
     Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
     free start and, at last, with relaxed tasks.
@@ -270,7 +270,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve candidates that collide once more: with bodies separated, and with the start fixed where it is clear.
+    """Solve colliding candidates again: with their bodies separated, or with a collision-free start that is fixed.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start

@@ -166,7 +166,7 @@ class _Sequence:
         return plan_goal(own, replace(goal, machine=None), self.horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
-        """Return the motion along tasks from the configuration `near` or, if they do not start there, from any.
+        """Return the motion along tasks from the configuration `near` or, if the tasks start elsewhere, from any start.
 
         Among start configurations, those count as better to which the motion from `near` costs less.
         """
@@ -184,7 +184,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _with_approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append the motion to the start of a task to the sequence, if needed; return the plan along the task."""
+        """Append an approach to the start of a task to the sequence, if needed; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -224,7 +224,7 @@ def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal at the start configuration of the next task's plan; if that is not at the goal, return the goal."""
+    """Return a goal at the joints at which the next task's plan starts; if they miss the goal, return it unchanged."""
     first = plan.at(0.0)
     if goal.region is not None or (
         goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START

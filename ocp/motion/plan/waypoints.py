@@ -10,7 +10,8 @@ segments may be requested (see `ocp.motion.search.reconfigurations`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -35,13 +36,15 @@ from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, S
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
 from ocp.motion.search.shortening import PathPoses, PathProblem, optimise_path, shorten_path
 from ocp.motion.search.steps import Steps
-from ocp.motion.search.task_search import TOO_MANY_CHARTS, lower_bound_along
+from ocp.motion.search.task_search import TOO_MANY_CHARTS, lower_bound_along, tool_motion_bound
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import LIMITED, Limits
 from ocp.motion.tasks.tip_task import TipTask
 
 WAYPOINT = "waypoint {:g}"
+MAX_REDUNDANT_JOINTS = 3
+"""Largest number of redundant joints for which a path is searched."""
 NO_PATH = "no path through the waypoints keeps all limits"
 
 
@@ -52,7 +55,7 @@ class WaypointSettings:
     Attributes:
         stride: With at most one redundant joint, every so many-th waypoint is searched, and half the stride is tried
             next if no path found goes through all.
-        first_steps: With two redundant joints, number of steps of a first search, which finds short paths.
+        first_steps: With two or three redundant joints, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
         sample_loss: With two redundant joints, share of the cost of the best path that straight steps between the
             waypoints of the lower bound may lose.
@@ -60,7 +63,7 @@ class WaypointSettings:
         widths: Initial and final spacing of the configurations of `shorten_path`, rad or m, before the path is brought
             to a local optimum.
         pose_tolerance: Largest pose error, m and rad.
-        search, sections: Settings of the searches with at most one redundant joint, and with two.
+        search, sections: Settings of the searches with at most one redundant joint, and with more.
     """
 
     stride: int = 5
@@ -91,9 +94,10 @@ def plan_path(
     """Plan the lowest-cost joint path through tool poses, within limits and collision-free at every waypoint.
 
     Args:
-        machine: An arm on a fixed base with at most two redundant joints for the poses of its tip. If it has two,
-            paths are searched on sections in which the joint nearest to the base has one of several values (see
-            `ocp.motion.search.reconfigurations`), and the bound on the whole manifolds.
+        machine: An arm on a fixed base with at most three redundant joints for the poses of its tip. If it has two or
+            three, paths are searched on sections in which the joint or joints nearest to the base have one of several
+            values (see `ocp.motion.search.reconfigurations`). The bound of two is searched on the whole manifolds; that
+            of three follows from the motion of the tool alone (`tool_motion_bound`), and is looser.
         waypoints: Poses of the tip.
         options: Cost, limits, and seed of inverse kinematics. The cost is the `length`, the sum of all joint
             displacements with the `weights` of the joints, which is the default, or the `time`, s, by the velocity
@@ -116,7 +120,7 @@ def plan_path(
         words += f"Cost(velocity=0, time=1), not {own_cost}"
         raise ProblemError(words, name="cost", value=own_cost)
     is_timed = own_cost.terms == ("time",)
-    for quantity in ("velocity", "acceleration", "jerk", "torque", "power"):
+    for quantity in LIMITED:
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
@@ -165,14 +169,15 @@ class _WaypointPlanner:
         self.manifolds = self.problem.samples[0].manifolds
         self.space = self.manifolds.space
         self._seed_cache = dict[int, Array]()
-        if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
+        if not 0 <= self.manifolds.size <= MAX_REDUNDANT_JOINTS:
             words = f"{machine.robot.name}: {int((~pose.idle).sum())} joints for the {pose.size} rows of a pose"
-            words += f"; lock joints until at most {MAX_FREE_DIRECTIONS} degrees of freedom are left"
-            raise ProblemError(words, name="machine", value=self.manifolds.size, limit=MAX_FREE_DIRECTIONS)
-        # with two redundant joints, sections fix the joint nearest to the base, which moves all others
+            words += f"; lock joints until at most {MAX_REDUNDANT_JOINTS} degrees of freedom are left"
+            raise ProblemError(words, name="machine", value=self.manifolds.size, limit=MAX_REDUNDANT_JOINTS)
+        # with several redundant joints, sections fix those nearest to the base, which move all others
         robot = machine.robot
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
-        self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
+        nearest = names[: max(self.manifolds.size - 1, 0)]
+        self._section_joints = tuple(robot.joint_names.index(name) for name in nearest)
 
     def plan(self, counted: bool) -> PathPlan:
         """Plan the lowest-cost path through all waypoints, in one segment or, if `counted`, in the fewest segments.
@@ -226,9 +231,12 @@ class _WaypointPlanner:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
         best = paths[0]
-        if self._section_joint is not None:
+        if self._section_joints:
+            bound = tool_motion_bound(self.machine, self.poses, self.cost, self.limits.bounds(self.machine))
+        if self.manifolds.size == MAX_FREE_DIRECTIONS:
             loss, settings = self.settings.sample_loss, self.settings.search
-            bound = lower_bound_along(self.problem, best.joints, loss, seeds=self._seeds, settings=settings)
+            searched = lower_bound_along(self.problem, best.joints, loss, seeds=self._seeds, settings=settings)
+            bound = max(bound, searched)
         lower_bound = checked_bound(bound, best.cost)
         candidates = [Candidate(best.joints[0], best.cost, None, Stage.FINE)]
         for path in paths[1:]:
@@ -252,11 +260,11 @@ class _WaypointPlanner:
     def _strides(self) -> tuple[list[int], int]:
         """Return the waypoint spacing of each successive search, and the number of searches that are always made."""
         settings, count = self.settings, len(self.positions)
-        if self._section_joint is None:
+        if not self._section_joints:
             halves = int(np.log2(settings.stride)) + 1
             return [settings.stride // 2**k for k in range(halves)], 1
         # a step must be able to lead from one section to the next
-        min_stride = min(4 * settings.sections.radii[1] / np.delete(self.step, self._section_joint).min(), count)
+        min_stride = min(4 * settings.sections.radii[1] / np.delete(self.step, self._section_joints).min(), count)
         strides = (max(min(each, count // settings.steps), int(np.ceil(min_stride)), 1) for each in settings.strides)
         return [-(-count // settings.first_steps), *strides], 2
 
@@ -268,7 +276,7 @@ class _WaypointPlanner:
         last, known_count = len(self.positions) - 1, 1 if known is None else len(known.times)
         while True:
             chosen = np.unique(np.linspace(0, last, -(-last // stride) + 1).round().astype(int))
-            if known is not None and self._section_joint is None:
+            if known is not None and not self._section_joints:
                 chosen = np.union1d(chosen, known.times.astype(int))
             if len(chosen) <= known_count:
                 return None
@@ -282,7 +290,7 @@ class _WaypointPlanner:
     def _search_at_failures(self, search: AtlasSearch, path: _Path | None) -> AtlasSearch | None:
         """Return a search that also includes the waypoints where a path is invalid, or None if that is impossible."""
         chosen = search.times.astype(int)
-        if path is None or self._section_joint is not None or np.isin(path.invalid, chosen).all():
+        if path is None or self._section_joints or np.isin(path.invalid, chosen).all():
             return None
         try:
             return self._search(np.union1d(chosen, path.invalid))
@@ -292,22 +300,28 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search for paths over some waypoints; of two redundant joints, one is fixed at several values."""
+        """Return the search for paths over chosen waypoints; all redundant joints but one have several fixed values."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
         samples = [TimeSample(manifolds, k) for k in range(len(chosen))]
-        joint = self._section_joint
         arguments = self.space, samples, Steps(chosen.astype(float), self.cost, distances * self.step)
-        if joint is None:
+        joints, settings = self._section_joints, self.settings.sections
+        if not joints:
             return AtlasSearch(*arguments, **options, settings=self.settings.search)
-        prismatic = self.machine.robot.moving_joints[joint].kind == "prismatic"
-        section_settings, limit = self.settings.sections, float((distances * self.step)[:, joint].min())
-        sections: dict[str, Any] = {"radius": section_settings.radii[coarse], "charts": section_settings.charts}
-        sections["values"] = section_values(
-            prismatic, self.lower[joint], self.upper[joint], limit, settings=section_settings
-        )
-        return SectionSearch(*arguments, **options, **sections, joint=joint)
+        shared = replace(settings, values=int(settings.values ** (1 / len(joints))))
+        values = [
+            section_values(
+                self.machine.robot.moving_joints[joint].kind == "prismatic",
+                self.lower[joint],
+                self.upper[joint],
+                float((distances * self.step)[:, joint].min()),
+                settings=shared,
+            )
+            for joint in joints
+        ]
+        sections: dict[str, Any] = {"radius": settings.radii[coarse], "charts": settings.charts}
+        return SectionSearch(*arguments, **options, **sections, joints=joints, values=np.array([*product(*values)]))
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
         """Return the error that names the first waypoint that no path reaches, which the search may have skipped."""
@@ -324,10 +338,10 @@ class _WaypointPlanner:
         If there is none, raise the SolveError that says why.
         """
         uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
-        if uncovered and self._section_joint is not None:
-            name = self.machine.robot.joint_names[self._section_joint]
-            words = f"{NO_PATH}: no configuration was found at waypoint {uncovered[0]:g} on the sections of {name!r}"
-            raise SolveError(words, name=name, time=uncovered[0])
+        if uncovered and self._section_joints:
+            names = [self.machine.robot.joint_names[joint] for joint in self._section_joints]
+            words = f"{NO_PATH}: no configuration was found at waypoint {uncovered[0]:g} on the sections of "
+            raise SolveError(words + " and ".join(map(repr, names)), name=names[0], time=uncovered[0])
         error = dead_end(search, WAYPOINT, proven=False)
         if error is None:
             return []

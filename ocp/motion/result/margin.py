@@ -72,7 +72,7 @@ PYRAMID_SIDES = 32
 
 
 class Requirements(NamedTuple):
-    """Requirements of one kind at M samples: sum of coefficients times sizes <= slack.
+    """Requirements of one kind at M samples: sum of coefficients times sizes of uncertainties <= slack.
 
     Attributes:
         name: Name of the limited quantity.
@@ -96,7 +96,7 @@ class Requirements(NamedTuple):
 
 
 class Range(NamedTuple):
-    """The largest size of an uncertainty, or factor of several sizes, and the limit that it reaches.
+    """Largest allowed size of an uncertainty, or common factor of several sizes, and the limit that it reaches.
 
     Attributes:
         size: Largest size (kg, share of the torque limits, or m), or factor.
@@ -146,7 +146,7 @@ class Margin:
 
     @property
     def sentence(self) -> str:
-        """What the plan withstands, in one sentence; sizes are rounded down."""
+        """Sentence that states which uncertainties the plan tolerates; sizes are rounded down."""
         texts = [describe_size(name, size) for name, size in self.together.items() if size > 0]
         none = [name for name, size in self.together.items() if not size > 0]
         parts = [f"keeps all limits for {_enumerate(texts)}"] if texts else []
@@ -169,7 +169,7 @@ def _enumerate(texts: list[str]) -> str:
 
 
 def describe_size(name: str, size: float, up: bool = False) -> str:
-    """Return the text about the size of an uncertainty, rounded down to few digits, or up if `up`."""
+    """Return a text that states the size of an uncertainty, rounded down to few digits, or up if `up`."""
     text, factor, _ = PHRASES[name]
     value = factor * size
     if value > 0:
@@ -202,7 +202,7 @@ def margin_of_plan(plan: Plan, uncertainty: Any = None, tolerance: float | None 
 
 
 class _Stacked(NamedTuple):
-    """Requirements of all kinds at all M samples: sum of coefficients times sizes <= slack."""
+    """Requirements of all kinds at all M samples: sum of coefficients times sizes of uncertainties <= slack."""
 
     coefficients: dict[str, Array]  # of each uncertainty, (M,)
     slack: Array
@@ -216,14 +216,14 @@ class _Stacked(NamedTuple):
         return cls(coefficients, slack, times, np.repeat([row.name for row in rows], [row.slack.size for row in rows]))
 
     def largest(self, growth: Array, left: Array) -> Range:
-        """Return the largest factor of a growth (M,) that the slacks (M,) allow, and the requirement that ends it."""
+        """Return the largest factor for which factor * growth (M,) <= left (M,), and the requirement that ends it."""
         factors = np.full(growth.shape, np.inf)
         np.divide(np.maximum(left, 0.0), growth, out=factors, where=growth > 0)
         row = int(factors.argmin())
         return Range(float(factors[row]), str(self.labels[row]), float(self.times[row]), row)
 
     def grow(self, weights: Mapping[str, float], stated: list[str]) -> tuple[dict[str, float], list[Range]]:
-        """Return sizes that are allowed together, and the requirements that end their growth, one after the other.
+        """Return the sizes of uncertainties that are allowed together, and the limits that end their growth in turn.
 
         All grow in proportion to their weights: first the stated ones, up to their weights if there are others, then
         the others. An uncertainty stops at the first requirement that allows no more of it.
@@ -261,7 +261,7 @@ def checked_uncertainty(value: Any) -> dict[str, float | None]:
 
 
 def tightened_torques(plan: Plan, sizes: Mapping[str, float]) -> dict[str, float]:
-    """Return torque limits that leave room for uncertainties, for the joints that a plan leaves too little, by name.
+    """Return tighter torque limits, by joint, for joints whose limits do not suffice for uncertainties of given sizes.
 
     The torque at the worst time is reduced in the ratio in which it would exceed its limit, and by TIGHTENING_SHARE
     more, because payloads add torque roughly in proportion to the torque without them.
@@ -369,7 +369,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     rows: list[Requirements] = []
 
     def bounded(values: Array) -> Array:
-        """Return upper bounds of values around the samples, of the same shape (M, ...)."""
+        """Return upper bounds of sampled values (M, ...) in the intervals around the samples."""
         steps = values.reshape(*times.shape, -1)
         bends = np.abs(np.diff(steps, n=2, axis=1)).max(axis=1, keepdims=True)
         return np.asarray((steps + bends).reshape(values.shape))
@@ -377,7 +377,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     def add(
         name: str, most: float, value: Array, change: Array, friction: Array | None = None, joint: str = ""
     ) -> None:
-        """Add the requirement value + payload times change + share of friction <= most, unless this is infinite."""
+        """Add the requirement value + payload times change + share of friction <= most, unless `most` is infinite."""
         if np.isfinite(most):
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})

@@ -25,7 +25,7 @@ from models.checks import MAX_LISTED, Array
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times, values_within
-from ocp.motion.result.candidate import Candidate, Stage
+from ocp.motion.result.candidate import Candidate, Rejection, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
@@ -276,9 +276,10 @@ class Plan(ABC):
             by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate)
         for reason, candidates in list(by_reason.items())[:most]:
             finite = [each for each in candidates if np.isfinite(each.cost)]
-            costs = [each.cost for each in finite] or [np.nan]
-            low, high = min(costs), max(costs)
-            if any(each.stage < Stage.FINE for each in finite):  # costs are estimates
+            low, high = (end((each.cost for each in finite), default=np.nan) for end in (min, max))
+            if not finite or reason == Rejection.DUPLICATE.value:  # estimates say nothing about the same motion
+                span = f"{'-':>10}"
+            elif any(each.stage < Stage.FINE for each in finite):  # costs are estimates
                 span = f"about {low:.3g}" + (f" to {high:.3g}" if low < high else "")
             else:
                 span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")

@@ -111,6 +111,11 @@ class MotionRequest:
         tasks = self.arguments.get("tasks", ())
         return (tasks,) if isinstance(tasks, TipTask) else tuple(tasks)
 
+    @property
+    def cost(self) -> Any:
+        """Cost that the builder takes, or None for its default."""
+        return getattr(self.arguments.get("actuation"), "cost", self.arguments.get("cost"))
+
     def __repr__(self) -> str:
         return f"<MotionRequest of {self.builder!r}: {', '.join(self.arguments)}>"
 

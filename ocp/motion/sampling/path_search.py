@@ -57,7 +57,7 @@ class TreeSearch:
     scale: Array
 
     def path(self, joints: Array) -> JointPath:
-        """Return corners (M, n) from the start to a goal as a path."""
+        """Convert corners (M, n) of a path from the start to a goal to a `JointPath` with goal index and length."""
         goal = int(np.abs(self.goals - joints[-1]).max(axis=1).argmin())
         return JointPath(joints, goal, path_length(joints, self.scale))
 

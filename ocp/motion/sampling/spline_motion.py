@@ -286,7 +286,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if self.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return p and matrix L of the cost |L c|^2 / T^p of a squared derivative; c: control points, T: duration."""
+        """Return p, L for which |L c|^2 / T^p is the cost of a squared derivative; c: control points, T: duration."""
         places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()

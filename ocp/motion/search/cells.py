@@ -195,7 +195,7 @@ class _CellPass:
         seed: int,
         settings: CellSettings,
     ) -> None:
-        """Prepare a run, which keeps the full number of states at each time if `full`, otherwise a smaller number."""
+        """Prepare a run of the search with few states at each time or, if `full`, as many as the settings allow."""
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
@@ -335,7 +335,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Return the states of one time after moving them to the poses of the tasks that begin at this time."""
+        """Move states to the poses of the tasks that begin at their time; return the states that reach these poses."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected

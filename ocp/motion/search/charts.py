@@ -49,7 +49,7 @@ class ChartSettings:
 
     corrections: int = 12
     spacing: float = 0.9
-    flatness: tuple[float, float, float] = (0.1, 0.1, 0.15)
+    flatness: tuple[float, float, float, float] = (0.1, 0.1, 0.15, 0.15)
     halvings: int = 7
     listed: int = 64
     starts: int = 16
@@ -246,7 +246,7 @@ class SelfMotionManifolds:
         return projected, converged
 
     def tangents_at(self, layer: Indices, joints: Array, like: Array | None = None) -> Array:
-        """Return bases (M, n, r) of the manifolds' tangent spaces at configurations (M, n), orthonormal in the metric.
+        """Return bases (M, n, r) of tangent spaces at configurations (M, n), orthonormal in the joint-space metric.
 
         Args:
             like: Bases to which the returned ones are aligned as closely as possible. Shape (M, n, r).

@@ -377,7 +377,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Minimise the deviation or rotation of the tips from their tasks near a path (K, n); return None if that fails."""
+    """Find the least position (if `turning`, orientation) error of tips near a path (K, n); None if that fails."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
@@ -399,7 +399,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
 
 
 class _RelaxedProblem:
-    """Nonlinear program that minimises the deviation or rotation of the tips and separates given pairs of bodies."""
+    """Nonlinear program for a path of least position or orientation error of the tips, with given bodies separated."""
 
     def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
@@ -438,7 +438,7 @@ class _RelaxedProblem:
             self._separations = ca.vec(distances) - search.scene.clearance - MARGIN
 
     def amount(self, path: Array) -> float:
-        """Return the largest deviation (m) or rotation (rad) of the tips from their tasks along a path (K, n)."""
+        """Return the largest position error (m) or orientation error (rad) of the tips along a path (K, n)."""
         largest = float(np.sqrt(float(self._largest_norm(path.T))))
         return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 

@@ -54,10 +54,10 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def pool(self, values: Array) -> Array:
-        """Sum values (n, ..., P) over the joints of each term of the norm: one joint, or all for a maximum norm."""
+        """Sum joint values (n, ..., P) in each term of the norm, which has one joint or, if a maximum, all joints."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of step costs plus later costs, multipliers (P, n), and step ends (P, r).
+        """Return lower bounds (P,) of the costs of steps and of motions after them, multipliers, and step ends (P, r).
 
         Args: As in `minimal_steps`. The least cost of P steps is that of the linear programs
 
@@ -189,7 +189,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`.
+    """Lower bounds of the cost of a step, proportional to its length, and of the motion after the step.
 
     On curves, the multipliers of each start are computed anew, since the cost has kinks. On manifolds of more
     dimensions this would take too long.
@@ -236,7 +236,7 @@ class HomogeneousBounds:
 
 
 def _longest_step(values: list[Array], changes: list[Array]) -> Array:
-    """Return the largest fraction, at most 1, of changes that keeps all values positive, for each of P programs."""
+    """Return, for P linear programs, the largest fraction, at most 1, of changes that keeps all values positive."""
     shares = np.zeros(values[0].shape[1])
     for value, change in zip(values, changes, strict=True):
         np.maximum(shares, (-change / value).max(axis=0), out=shares)

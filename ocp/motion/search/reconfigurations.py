@@ -8,9 +8,10 @@ the bounds of the cost-to-go bound the cost of a segment, and segments are searc
 can cost less. Their number is minimised first, then the cost, as in IKLink (Wang et al. 2024).
 
 If a task leaves two degrees of freedom undetermined, the manifold at a time sample is a surface, which takes too many
-charts for an arm of eight joints. With one joint fixed it is a curve (a section). The curves for several values of the
-joint are close enough for steps between them, so that paths on which the joint moves are found as well; shortened on
-the surfaces, they leave the curves. This proves nothing and gives no bound.
+charts for an arm of eight joints. With one joint fixed it is a curve (a section), with three directions and two joints
+as well. The curves for several values of the joints are close enough for steps between them, so that paths on which the
+joints move are found too; shortened on the whole manifolds, they leave the curves. This proves nothing and gives no
+bound.
 """
 
 from __future__ import annotations
@@ -227,8 +228,8 @@ class SectionSettings:
 
     Attributes:
         radii: Radii of the charts for few and for many samples, rad or m.
-        spacing: Largest difference between values of the joint: prismatic, m, and revolute, rad.
-        values: Largest number of values of the joint.
+        spacing: Largest difference between values of a joint: prismatic, m, and revolute, rad.
+        values: Largest number of values of the joint, or of combinations of values of several joints.
         charts: Largest number of charts, over all samples and values.
     """
 
@@ -256,29 +257,33 @@ def section_values(
 
 
 class SectionSearch(AtlasSearch):
-    """Search for paths on sections of the self-motion manifolds; on each section, one joint has a fixed position."""
+    """Search for paths on sections of the self-motion manifolds; on each section, some joints have fixed positions."""
 
-    def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
-        """Build charts of the self-motion manifolds cut at fixed values of a joint, at all time samples.
+    def __init__(
+        self, *args: Any, joints: tuple[int, ...], values: Array, radius: float, charts: int, **options: Any
+    ) -> None:
+        """Build charts of the self-motion manifolds cut at fixed values of joints, at all time samples.
 
         Args:
-            args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.
-            joint: Index of the joint.
-            values: Values at which it is fixed. Shape (V,).
+            args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds`, of one dimension
+                more than there are joints.
+            joints: Indices of the joints.
+            values: Values at which they are fixed. Shape (V, joints).
             radius: Largest radius of the charts.
             charts: Largest number of charts.
         """
-        self._joint, self._values, self._radius, self._max_charts = joint, values, radius, charts
+        self._joints, self._values, self._radius, self._max_charts = joints, values, radius, charts
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return for each time sample the charts of the self-motion manifold's curves on which one joint is fixed."""
+        """Return for each time sample the charts of the self-motion manifold's curves on which joints are fixed."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
         fixed = manifolds.equations.fixed if isinstance(manifolds.equations, TasksWithFixedJoints) else ()
-        equations = TasksWithFixedJoints(manifolds.equations.machine, manifolds.equations.bound, (*fixed, self._joint))
-        targets = np.column_stack([targets, np.repeat(self._values, count)])
+        fixed = (*fixed, *self._joints)
+        equations = TasksWithFixedJoints(manifolds.equations.machine, manifolds.equations.bound, fixed)
+        targets = np.column_stack([targets, np.repeat(self._values, count, axis=0)])
         self._curves = SelfMotionManifolds(self.space, equations, targets)
         seed_configurations = [seeds(k) for k in range(count)]
         samples = np.repeat(np.arange(count), [len(configurations) for configurations in seed_configurations])
@@ -292,13 +297,14 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best paths over all sections and on each one, by increasing cost, and the cost bound 0."""
-        count = len(self.samples)
-        paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
+        """Return paths over all sections and on single sections, sorted by cost, and 0 as their lower cost bound."""
+        count, through_centers = len(self.samples), list[Array]()
         for value in range(len(self._values)):
             restricted = copy(self)
             restricted.layers = [charts.select(charts.layer // count == value) for charts in self.layers]
             if all(len(charts) for charts in restricted.layers):
-                path = restricted._shorten(restricted._path_through_centers(restricted.full_graph()), restricted.layers)
-                paths += [path] if path is not None else []
-        return sorted(paths, key=self.path_cost), 0.0
+                path = restricted._path_through_centers(restricted.full_graph())
+                through_centers += [path] if path is not None else []
+        best = sorted(through_centers, key=self.path_cost)[: self.settings.max_classes]
+        shortened = [self.find_path(np.inf)[1], *(self._shorten(path, self.layers) for path in best)]
+        return sorted((path for path in shortened if path is not None), key=self.path_cost), 0.0

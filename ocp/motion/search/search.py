@@ -27,7 +27,7 @@ from models import CollisionScene
 from models.checks import Array
 from ocp.console import TimeLimitReached
 from ocp.errors import BoundWarning
-from ocp.motion.local.collisions import distances_along
+from ocp.motion.local.collisions import distances_along, largest_changes
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, concatenate, point_chart
 from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
@@ -146,14 +146,12 @@ class AtlasSearch:
             layer, joints = (np.array(part) for part in zip(*configurations, strict=True))
             charts = sets.cover(layer, joints, self.settings.radii[sets.size], self.settings.charts)
             atlas += [charts.select(charts.layer == self.samples[k].row) for k in rows]
-        if self.start is not None:
-            atlas[0] = point_chart(self.start)
+        atlas = atlas if self.start is None else [point_chart(self.start), *atlas[1:]]
         for k, charts in enumerate(atlas):
             if not len(charts):
                 seeds(k)  # raises an error that names the pose
                 words = f"at {self.times[k]:.4g} s no configuration that does the tasks is within limits"
-                time = float(self.times[k])
-                raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=time)
+                raise Unreachable(words, np.full(len(self.space.scale), np.nan), np.nan, time=float(self.times[k]))
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
@@ -161,12 +159,17 @@ class AtlasSearch:
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
-        scene = self.scene
-        if scene is None or not len(charts):
-            return np.ones(len(charts), dtype=bool)
-        times, base = np.full(len(charts), self.times[k]), np.zeros(0)
-        distances = distances_along(scene, base, charts.centers, times, cutoff=scene.clearance)
-        return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
+        """Return which charts of a time sample may contain a configuration without collision. Shape (N,)."""
+        scene, free = self.scene, np.ones(len(charts), dtype=bool)
+        if scene is None:
+            return free
+        times = np.full(len(charts), self.times[k])
+        distances = distances_along(scene, np.zeros(0), charts.centers, times, cutoff=scene.clearance)
+        at, pair = np.nonzero(distances < scene.clearance)
+        box = charts.tangents, np.maximum(np.abs(charts.low), np.abs(charts.high)), charts.max_deviation
+        largest = distances[at, pair] + largest_changes(scene, charts.centers, at, pair, box=box)
+        free[at[largest < scene.clearance]] = False
+        return free
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
         """Return the graph whose nodes are manifold charts and whose edges are steps of limited cost between charts.
@@ -333,7 +336,7 @@ class AtlasSearch:
         return self._branch_and_bound(layers, max_cost, self.path_cost(best_path), best_path)
 
     def lower_bound(self, known_cost: float) -> float:
-        """Return a lower bound of the cost of all paths, at most `known_cost` less the gap that ends the search.
+        """Return a lower bound of the cost of all paths, at most (1 - `gap`) times `known_cost`.
 
         No path is searched. The bound is what time limit and memory allow. `known_cost` is that of a known motion.
         """
@@ -342,7 +345,7 @@ class AtlasSearch:
     def _branch_and_bound(
         self, layers: list[Charts], max_cost: float, best_cost: float, best_path: Array | None
     ) -> tuple[Array | None, float]:
-        """Return the best path, which is improved if one is given, and a lower bound of the cost of all paths."""
+        """Improve the given path, if any, and return it with a lower bound of the cost of all paths."""
         target, bound = 1 - self.gap, 0.0
         coarse = best_path is not None
         remaining = np.zeros(len(self.times) - 1)  # least cost before and after each step
@@ -383,7 +386,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
-        """Return the path cost up to which charts are halved, as memory permits; -inf if splitting must end."""
+        """Return the cost bound below which charts are halved, as high as memory permits; -inf if halving must end."""
         costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
         if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
             return -np.inf
@@ -393,7 +396,7 @@ class AtlasSearch:
         return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path whose steps each cost at most `max_cost`; return the charts such paths may use, and the path.
+        """Find a path whose steps each cost at most `max_cost`; return charts that may contain one, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -416,7 +419,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Shorten the path along the least cost-to-go bound; return None if it breaks off or has too long steps."""
+        """Return a path through charts of least cost-to-go bound, shortened; None if it breaks off or is invalid."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 

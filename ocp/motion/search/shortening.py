@@ -119,7 +119,7 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Each manifold with its time samples: their indices along the path, and their row numbers in the manifold."""
+        """Distinct manifolds, each with the indices of its time samples along the path and their row numbers in it."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]
@@ -172,7 +172,7 @@ class PathProblem:
         return float(excess)
 
     def distances(self, path: Array, change: Array | None) -> tuple[Indices, Array, Array]:
-        """Return the samples of close pairs of bodies, their distances beyond the clearance, m, and the gradients.
+        """Return samples of P close pairs of bodies, their distances beyond the clearance, m, and distance gradients.
 
         Bodies are close if joint displacements `change` (K, n) may bring them below the clearance; None: if they are
         below it, without gradients. Shapes (P,), (P,), (P, n).
@@ -194,7 +194,7 @@ class ShorteningSettings:
         least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
     """
 
-    neighbours: tuple[int, int, int] = (0, 5, 2)
+    neighbours: tuple[int, int, int, int] = (0, 5, 2, 1)
     max_moves: int = 10
     least_gain: float = 1e-4
 
@@ -206,13 +206,13 @@ def shorten_path(
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
-        problem: Manifolds, all of dimension one or all of two (others leave the path unchanged), steps and limits.
+        problem: Manifolds, all of one dimension from one to three (others leave the path unchanged), steps and limits.
         widths: Initial and final spacing of the configurations, in the metric.
         settings: Settings of the dynamic programming.
     """
     joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
     steps, dimension, tangents = problem.steps, problem.dimension, None
-    if dimension not in (1, 2):
+    if dimension not in (1, 2, 3):
         return path
     count_per_side = settings.neighbours[dimension]
     shifts = np.array(list(product(np.arange(-count_per_side, count_per_side + 1.0), repeat=dimension)))
@@ -362,7 +362,7 @@ class _LocalProgram:
         return scipy.sparse.csr_array(entries, shape=(len(k), self._path.size))
 
     def _cost_rows(self) -> tuple[_Rows, Indices]:
-        """Return the linear pieces of the cost that may be largest within the trust region, and their groups."""
+        """Return linear functions and group numbers: the groups' maxima add up to the cost in the trust region."""
         delta, by_joint = np.diff(self._path, axis=0), isinstance(self._problem.steps.cost, PathLength)
         k, joint, sign = (index.ravel() for index in np.indices((*delta.shape, 2)))
         factor, reach = (2.0 * sign - 1.0) * self._problem.weights[joint], self._size[1:] + self._size[:-1]

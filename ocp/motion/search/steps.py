@@ -90,7 +90,7 @@ class CurvedCharts(NamedTuple):
 
 
 class StepBounds(Protocol):
-    """Lower bounds of the costs of P steps plus the costs after the steps, as functions of the start coordinates.
+    """Lower bounds of the costs of P steps plus the costs after them, as functions of the steps' starts on charts.
 
     Each point p yields a quadratic function that is a lower bound everywhere, by the value and slope at p and `curve`.
     """
@@ -103,10 +103,10 @@ class StepBounds(Protocol):
         """Return the lower cost bounds of those steps that have the given indices."""
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
+        """Return values (P,) and gradients (P, r) of the cost bounds for steps that start at chart points (P, r)."""
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates t where bound(t) - slope . t - t . curve . t / 2 is not above its value at `places`.
+        """Return coordinates t at which bound(t) - slope . t - t . curve . t / 2 is no larger than at `places`.
 
         All arguments have one entry for each step.
         """
@@ -136,7 +136,7 @@ class StepCost(ABC):
     def quick_bounds(
         self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
     ) -> Array:
-        """Return constant lower bounds (P,) of `lower_bounds` over the source box that are quick to compute.
+        """Return quickly computed constants (P,) that are lower bounds of `lower_bounds` in the source charts.
 
         The displacements of the joints differ from `delta` by at most `spans` (P, n).
         """
@@ -271,7 +271,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of a step and of the motion after it, as functions of where the step starts.
+    """Lower bounds of the cost of a step and of the motion after it, as functions of where on a chart the step starts.
 
     The cost is the integral of the squared joint rates; places are coordinates in the chart.
 
@@ -307,7 +307,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the bounds over the end of a step; return step to the chart centre, minimum and minimiser."""
+        """Minimise the bounds over the ends of steps; return steps to the chart centres, minima and minimisers."""
         start = self.projection - apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 

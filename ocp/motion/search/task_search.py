@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 from warnings import warn
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
+from models import FixedBase, Sphere
 from models.checks import Array
+from models.shapes.bodies import RigidParts, lever_arms
 from ocp.console import TimeLimitReached
 from ocp.errors import BoundWarning, ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
@@ -25,12 +28,15 @@ from ocp.motion.search.configurations import (
     locate_error,
 )
 from ocp.motion.search.dead_end import DeadEnd, dead_end
-from ocp.motion.search.joint_space import FULL_TURN, JointSpace
+from ocp.motion.search.joint_space import FULL_TURN, TOLERANCE, JointSpace
+from ocp.motion.search.lengths import Homogeneous
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings
-from ocp.motion.search.shortening import PathProblem
+from ocp.motion.search.shortening import PathPoses, PathProblem
 from ocp.motion.search.steps import SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import TaskEquations
+from ocp.motion.tasks.limits import JointBounds
+from ocp.tolerances import ROUNDING_SHARE
 
 
 @dataclass(frozen=True)
@@ -214,7 +220,7 @@ class TaskSearch:
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return bound, time and configuration of the classes of motions without a path whose bound is below `cost`."""
+        """Return cost bound, time and configuration of each class of motions below a `cost` without a known path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
@@ -274,7 +280,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose few sample times of a motion such that straight steps between them cost at most a given fraction less.
+    """Choose few times of a motion so that straight steps between them cost at most the fraction `share` less than it.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.
@@ -345,5 +351,54 @@ def lower_bound_along(
             if error.name != TOO_MANY_CHARTS:
                 raise
             refusal = error
-    warn(BoundWarning(f"there is no lower bound of the cost: {refusal}", **vars(refusal)), stacklevel=2)
+    warn(BoundWarning(f"no lower bound of the cost was searched: {refusal}", **vars(refusal)), stacklevel=2)
     return 0.0
+
+
+def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, bounds: JointBounds) -> float:
+    """Return a lower bound of the cost of all joint paths through tool poses, for any number of redundant joints.
+
+    It follows from the motion of the tool alone. A step with joint displacements d moves a point of the tool by at most
+    lever . |d|, and rotates the tool by at most turn . |d|. The least cost of a step is thus at least that of a linear
+    program with one row for each of two points and one for the rotation. Each feasible point of the dual program,
+
+        maximise  distances . y,   y >= 0,   dual norm of (levers' y) <= 1,
+
+    gives a lower bound for all steps. Its vertices are enumerated. The points are the tip and, at a wrist, the point of
+    the last axis nearest to the axis before, of which fewer joints move.
+    """
+    robot, parts = machine.robot, RigidParts.of(machine.robot)
+    chain = parts.path(parts.of_link[robot.root], parts.of_link[robot.tip_link])[1]
+    rotation, translation = parts.pose[robot.tip_link]
+    tip, axes = translation + rotation @ robot.tip_translation, rotation @ robot.tip_rotation
+    points = [tip]
+    if len(chain) > 1:
+        last, before, offset = chain[-1], np.asarray(chain[-2].joint.axis), np.asarray(chain[-1].translation)
+        along = last.rotation @ last.joint.axis
+        slope = max(1 - (along @ before) ** 2, ROUNDING_SHARE)
+        points.append(((offset @ before) * (along @ before) - offset @ along) / slope * last.joint.axis)
+    levers = np.zeros((len(points) + 1, robot.dof))
+    down = [(step, True) for step in chain]
+    ends = [Sphere(TOLERANCE, point) for point in points]
+    arms = [lever_arms(robot, down, end, low=bounds.lower, high=bounds.upper)[0] for end in ends]
+    for (joint, *_), *reach in zip(chain, *arms, strict=True):
+        column, ratio, _ = robot.couplings[joint.name]
+        turn = 0.0 if joint.kind == "prismatic" else 1.0
+        levers[:, column] += abs(ratio) * np.array([*(arm if turn else 1.0 for arm in reach), turn])
+    places = [poses.positions + poses.rotations @ (axes.T @ (point - tip)) for point in points]
+    attitudes = scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
+    turns = attitudes[:-1].inv() * attitudes[1:]
+    lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rates = np.where(levers > 0, levers / cost.weights, 0.0)
+    rows = np.flatnonzero(np.isfinite(rates).all(axis=1))  # a joint that costs nothing takes the tool along
+    if not rows.size:
+        return 0.0
+    limits, count = cost.pool(rates[rows].T), len(rows)
+    planes, right = np.vstack([limits, np.eye(count)]), np.append(np.ones(len(limits)), np.zeros(count))
+    corners = np.array([*combinations(range(len(planes)), count)])
+    corners = corners[np.abs(np.linalg.det(planes[corners])) > 0]
+    vertices = np.maximum(np.linalg.solve(planes[corners], right[corners][:, :, None])[:, :, 0], 0.0)
+    vertices /= np.maximum((vertices @ limits.T).max(axis=1, keepdims=True), 1.0)  # others are moved into the polytope
+    distances = np.stack([*lengths, turns.magnitude()], axis=1)[:, rows]
+    return float((distances @ vertices.T).max(axis=1).sum())

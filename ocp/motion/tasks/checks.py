@@ -70,7 +70,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Clip joint positions or velocities (n,), nan where free, to limits that rounding errors alone may have exceeded.
+    """Clip joint positions or velocities (n,), nan where free, that exceed limits by no more than rounding errors.
 
     Raises:
         ProblemError: A joint is outside its limits; `label` names the values, and `hint` says what to do.
@@ -182,7 +182,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return numbers of the task equations for messages: the twist components 0..5 of one task, indices for several."""
+    """Return the numbers by which messages name the task equations: twist components 0..5 of one task, else indices."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)

@@ -232,10 +232,10 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return pose errors, m and chords of the unit circle, that do not vanish at half a turn. Shape (_, 1).
+        """Return position errors, m, and rotation errors 2 sin(angle / 2), unlike `error` nonzero at half a turn.
 
-        If all rotation is prescribed, the chords (2 sin(angle / 2), near zero the angle in rad) are the differences of
-        the frame axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries.
+        If all rotation is prescribed, the rotation errors (near zero the angle in rad) are the differences of the frame
+        axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries. Shape (rows, 1).
         """
         rows: list[Any] = [ca.DM(0, 1)]
         for part, target in self.by_task(targets):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Convert a start, joints or None to (Start, joint positions (n,) or None if free, base configuration).
+        """Convert a start, joint positions or None to a `Start`; also return its joints (n,) or None, and its base.
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -45,7 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a start or joints to (Start, joint positions (n,), base configuration); no joint may be free.
+        """Convert a start or joint positions to a `Start`; also return its joints (n,), all given, and its base.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.
@@ -167,6 +167,7 @@ class Waypoints:
 
 
 PER_JOINT = ("effort", "acceleration")
+"""Terms of the cost that may have a weight for each joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,26 +205,23 @@ class Cost:
     weights: Any = None
 
     def __post_init__(self) -> None:
-        each = [
-            require.array(f"cost: {name}", getattr(self, name), ("joints",), sign="nonnegative") for name in PER_JOINT
-        ]
-        single = [require.nonnegative(f"cost: {name}", getattr(self, name)) for name in self._single]
-        if not (any(single) or np.concatenate(each).any()):
+        for name in TERMS:
+            if name in PER_JOINT:
+                require.array(f"cost: {name}", getattr(self, name), ("joints",), sign="nonnegative")
+            else:
+                require.nonnegative(f"cost: {name}", getattr(self, name))
+        if not self.terms:
             raise ProblemError("cost: at least one weight must be above zero", name="cost", value=self, limit=0.0)
-
-    @property
-    def _single(self) -> tuple[str, ...]:
-        return ("velocity", "time", "length", "energy", "jerk", "turning")
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Names of the terms of the cost whose weights are not zero."""
-        return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
+        return tuple(name for name in TERMS if np.any(np.asarray(getattr(self, name))))
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
         """Return the cost with the weights of a subset of the joints, given as a mask (n,)."""
-        names = ("effort", "acceleration", "weights")
-        own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
+        names = [name for name in (*PER_JOINT, "weights") if np.ndim(getattr(self, name))]
+        own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names}
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
@@ -233,6 +231,10 @@ class Cost:
     def __repr__(self) -> str:
         weighted = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.terms)
         return f"Cost({weighted}{'' if self.weights is None else f', weights={self.weights!r}'})"
+
+
+TERMS = tuple(term.name for term in fields(Cost) if term.name != "weights")
+"""Names of all terms of the cost."""
 
 
 @dataclass(frozen=True, eq=False)

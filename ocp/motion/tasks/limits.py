@@ -200,8 +200,15 @@ def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
             raise ProblemError(words, name=name, value=place, limit=machine.support.vertices, time=float(time))
 
 
-LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
-"""Names of the limits that are given as one number for each joint, or as one number for all joints."""
+LIMITED = {
+    "velocity": "rad/s or m/s",
+    "acceleration": "rad/s^2 or m/s^2",
+    "jerk": "rad/s^3 or m/s^3",
+    "torque": "N m or N",
+    "power": "W",
+}
+"""Limits that are given as one number for each joint or for all joints, and their units: fields of `Limits` and of
+`JointBounds`, entries of the table [limits] in task files and, except for the power, options of `selfmotion check`."""
 
 
 class JointBounds(NamedTuple):
@@ -268,8 +275,8 @@ class Limits:
         """Return the least permitted vertical ground force on a standing machine, N."""
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
-    def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
-        """Return the limits of a subset of a machine's joints, given as a mask (n,)."""
+    def of_joints(self, chosen: NDArray[Any]) -> Limits:
+        """Return the limits of some of a machine's joints, given as a mask (n,) or as indices in a new order."""
         own: dict[str, Any] = {kind: floats(getattr(self, kind)) for kind in LIMITED if np.ndim(getattr(self, kind))}
         return replace(self, **{kind: values[chosen] for kind, values in own.items()})
 
@@ -286,7 +293,7 @@ class Limits:
             raise ProblemError(words, name="robust", value=self.robust)
         robot, n = machine.robot, machine.joint_size
         inf = np.full(n, np.inf)
-        values = {"velocity": robot.velocity, "acceleration": inf, "jerk": inf, "torque": robot.effort, "power": inf}
+        values = {**dict.fromkeys(LIMITED, inf), "velocity": robot.velocity, "torque": robot.effort}
         for kind in values:
             value = getattr(self, kind)
             if value is not None:

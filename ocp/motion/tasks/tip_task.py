@@ -9,19 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Self, TypeAlias, get_args
+from warnings import warn
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FreeFloating, Machine, SmoothPath, center_of_mass
+from models import FreeFloating, Machine, ModelWarning, SmoothPath, center_of_mass
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, skew
 from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
-from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
+from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 Velocity: TypeAlias = Any  # constant or function of time with one entry for each row of the task
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
@@ -160,6 +161,9 @@ class TipTask:
         Raises:
             ProblemError: `path` is not a path, a number is not positive, an attribute is invalid, or acceleration and
                 jerk are given for a steady motion or beside a Schedule.
+
+        Warns:
+            ModelWarning: The path is too short for the tip to reach the speed between the ramps.
         """
         require.choice("roll", roll, get_args(Roll))
         if hasattr(speed, "profile"):
@@ -170,7 +174,12 @@ class TipTask:
             _refuse_ramps("a steady motion has no ramps", acceleration=acceleration, jerk=jerk)
         else:
             require.instance("path", path, SmoothPath)
-            speed = rest_profile(path.length, checked_speed(speed), *ramp_limits(acceleration, jerk))
+            requested, ramps = checked_speed(speed), ramp_limits(acceleration, jerk)
+            speed = rest_profile(path.length, requested, *ramps)
+            if (peak := float(speed.speed.max())) < (1 - LIMIT_SHARE) * requested:
+                words = f"the path of {path.length:.4g} m is too short for {requested:g} m/s from rest to rest: at an "
+                words += f"acceleration of {ramps[0]:g} m/s^2 the tip reaches {peak:.4g} m/s"
+                warn(ModelWarning(words, name="speed", value=requested, limit=peak), stacklevel=2)
         tracks = path_tracks(path, speed)
         attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
@@ -285,8 +294,8 @@ class BoundTask(NamedTuple):
 
     @property
     def target_rows(self) -> dict[str, tuple[slice, slice]]:
-        """Rows of a pose's targets in the column of targets, and of their velocities (3 rows), by name: "position" (3
-        rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows), if prescribed.
+        """Rows of the column of targets that contain each prescribed target and, in 3 rows, its velocity, by name:
+        "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows).
         """
         rows, at = dict[str, tuple[slice, slice]](), 0
         for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):

@@ -1,13 +1,8 @@
-"""Estimation of parameters from data at given times: one phase between two times, with the parameters in common.
-
-The names of the parameters are those of free parameters of every phase; `Phases.join` makes them continuous. Each phase
-charges the squared residual at its end, the first one also that at its start.
-"""
+"""Estimation of parameters from data at given times: least squares of the residuals at these times."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -16,11 +11,11 @@ import numpy.typing as npt
 
 from ocp import Phases, Problem
 
-from .entry import line
+from .entry import samples
 
 Array = npt.NDArray[np.float64]
 Declare = Callable[[Problem, Any], Any]
-"""Of a phase and its states: declares parameters, controls and limits, and returns the rates of the states."""
+"""Of a problem and its states: declares parameters, controls and limits, and returns the rates of the states."""
 
 
 def estimation(
@@ -42,20 +37,11 @@ def estimation(
         lower: Bound of all states.
         guess: States at the times, (M, states); by default the data.
     """
-    measured = data.shape[1]
-    at = data if guess is None else guess
-    legs = {}
-    for k, (begin, end) in enumerate(pairwise(times)):
-        leg = legs[f"p{k}"] = Problem(f"p{k}")
-        here = initial if k == 0 else None
-        y = leg.state("y", states, initial=here, lower=lower, guess=line(at[k], at[k + 1], end - begin))
-        leg.horizon(end - begin)
-        leg.dynamics(y, declare(leg, y))
-        cost = ca.sumsqr(y[:measured] - data[k + 1])
-        if k == 0 and initial is None:
-            cost += ca.sumsqr(leg.at_start(y)[:measured] - data[0])
-        leg.minimize(terminal=cost)
-    phases = Phases(name, legs)
-    for before, after in pairwise(legs):
-        phases.join(before, after)
-    return phases
+    measured, at, start = data.shape[1], data if guess is None else guess, times[0]
+    problem = Problem(name)
+    y = problem.state("y", states, initial=initial, lower=lower, guess=samples([t - start for t in times], at.tolist()))
+    problem.horizon(times[-1] - start)
+    problem.dynamics(y, declare(problem, y))
+    known = 0 if initial is None else 1
+    residuals = zip(times[known:], data[known:], strict=True)
+    return Phases.with_costs_at(problem, {t - start: ca.sumsqr(y[:measured] - row) for t, row in residuals})

@@ -2,7 +2,8 @@
 
 Volume x1, cell density x2, nutrient x3, foreign protein x4, inducer x5, and two factors of the growth rate, x6 and x7,
 10 h, greatest x1 x4 at the end. Lee & Ramirez, AIChE Journal 40, 1994; PROPT manual; PSOPT, example bioreactor, which
-adds (0.1 / nodes) (u1'^2 + u2'^2) to the cost; here the feeds are free, so that a nearly singular feed may ring.
+adds (0.1 / nodes) (u1'^2 + u2'^2) to the cost; here the feeds are free, so that a nearly singular feed may ring. The
+lower bounds are physical: those of PSOPT, -10, contain poles of the rates.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ START = [1.0, 0.1, 40.0, 0.0, 0.0, 1.0, 0.0]
 
 def build() -> Problem:
     problem = Problem("Lee-Ramirez bioreactor")
-    x = problem.state("x", initial=START, lower=-10.0, upper=[10.0, 10.0, 50.0, 10.0, 10.0, 10.0, 10.0], guess=START)
+    x = problem.state(
+        "x",
+        initial=START,
+        lower=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        upper=[10.0, 10.0, 50.0, 10.0, 10.0, 10.0, 10.0],
+        guess=START,
+    )
     u = problem.control("u", 2, lower=0.0, upper=1.0, guess=lambda t: [t / 30, 0.0])
     problem.horizon(10.0)
     volume, cells, nutrient, protein, inducer, shock, recovery = ca.vertsplit(x)

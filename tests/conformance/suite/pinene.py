@@ -35,4 +35,4 @@ def build() -> Phases:
     return estimation("alpha-pinene", TIMES, DATA, rates, states=5, initial=START)
 
 
-ENTRY = Entry("pinene", (COPS,), build, {COPS: 19.872}, method=Collocation(4, 4), second=Collocation(6, 3, "legendre"))
+ENTRY = Entry("pinene", (COPS,), build, {COPS: 19.872}, method=Collocation(4, 3), second=Collocation(6, 3, "legendre"))

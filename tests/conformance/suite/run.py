@@ -37,12 +37,15 @@ SHARE = 0.1
 Row = dict[str, Any]
 
 
-def refined(problem: Problem, method: Method) -> Solution:
-    """The plan on a mesh that is refined by its audits; by the minimum principle where that is the method."""
+def refined(problem: Problem, method: Method, guess: Solution | None = None) -> Solution:
+    """The plan on a mesh that is refined by its audits; by the minimum principle where that is the method.
+
+    It may lose as much cost as costs may differ that agree.
+    """
     if isinstance(method, Indirect):
         return solve(problem, method)
-    settings = RefinementSettings(max_intervals=FINER * method.intervals)
-    return refine(problem, method, settings=settings)
+    settings = RefinementSettings(limits={"lost": DEVIATION}, max_intervals=FINER * method.intervals)
+    return refine(problem, method, settings=settings, guess=guess)
 
 
 def confirmed(entry: Entry, first: Solution) -> Row:
@@ -56,7 +59,7 @@ def confirmed(entry: Entry, first: Solution) -> Row:
     if not digits(first.cost, cost) >= 2 and not isinstance(entry.second, Indirect):
         row |= {"second_start": "first plan", "second_from_guess": cost}
         try:
-            cost = solve(entry.build(), entry.second, guess=first).cost
+            cost = refined(entry.build(), entry.second, first).cost
         except Exception as error:
             row["second_failed"] = words(error)
     return row | {"second_cost": cost, "digits": digits(first.cost, cost)}

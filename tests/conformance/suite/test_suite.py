@@ -81,8 +81,8 @@ def test_the_table_has_stated_problems_and_every_column() -> None:
     assert tuple(next(iter(ROWS.values()))) == COLUMNS
 
 
-def test_at_least_sixty_two_problems_are_settled() -> None:
-    assert len(SETTLED) >= 62
+def test_two_methods_confirm_nineteen_of_twenty_problems() -> None:
+    assert len(SETTLED) >= 0.95 * len(ENTRIES)
 
 
 def test_no_cost_contradicts_a_second_method() -> None:
@@ -111,6 +111,7 @@ def test_the_page_counts_the_problems_that_are_solved_without_a_method() -> None
         assert float(row["automatic_seconds"]) < 61
         assert reached(float(row["automatic_cost"]), float(row["cost"])), row["name"]
     unguessed = sum(row["automatic_start"] == "no guess" for row in solved)
+    assert unguessed >= 0.85 * len(ENTRIES)
     match = re.search(
         r"solves (\d+) of the (\d+) problems without a guess, (\d+) more", PAGE.read_text(encoding="utf-8")
     )

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pinocchio
 import pytest
@@ -69,11 +70,14 @@ def chain(kinds: str = "rrr", extra: dict[int, str] | None = None) -> str:
 @few
 def test_pinocchio_reads_a_written_robot_with_equal_kinematics(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
-    robot = random_robot(rng, size)
-    limits: Any = {"velocity": 1.0, "effort": 1.0}  # of every joint, as Pinocchio wants them
-    robot = replace(robot, joints=tuple(replace(joint, **limits) if joint.moves else joint for joint in robot.joints))
+    robot = with_limits_and_shapes(random_robot(rng, size), rng)
     model = pinocchio.buildModelFromXML(robot.to_urdf(), pinocchio.JointModelFreeFlyer())
     peer = Peer(model, robot)
+    largest = np.finfo(float).max
+    for joint in (joint for joint in robot.joints if joint.moves):
+        index = model.joints[model.getJointId(joint.name)].idx_v
+        for own, theirs in ((joint.velocity, model.upperVelocityLimit), (joint.effort, model.upperEffortLimit)):
+            assert min(theirs[index], largest) == min(own, largest)
     state = random_state(robot, rng)
     configuration, place = peer.configuration(state), (state.rotation, state.position)
     pinocchio.framesForwardKinematics(model, peer.data, configuration)
@@ -100,7 +104,9 @@ def test_a_robot_that_is_written_is_read_again_with_the_same_functions(seed: int
     assert_same_robot(robot, again, rng)
     for joint in robot.joints:
         read = again.joint(joint.name)
-        parts = ("kind", "parent", "child", "lower", "upper", "velocity", "effort", "mimic")
+        parts = ("parent", "child", "lower", "upper", "velocity", "effort", "mimic")
+        endless = joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
+        assert read.kind == ("continuous" if endless else joint.kind)
         assert [getattr(joint, part) for part in parts] == [getattr(read, part) for part in parts]
     for link in robot.links:
         assert again.link(link.name).mass == link.mass
@@ -145,6 +151,34 @@ def test_a_rotation_is_written_exactly_to_rounding_at_the_gimbal_lock_too(
         joint = Joint("j", "fixed", "a", "b", rotation=turn)
         again = Robot.from_urdf(Robot((Link("a"), Link("b")), (joint,)).to_urdf()).joints[0]
         np.testing.assert_allclose(again.rotation, joint.rotation, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+@pytest.mark.parametrize("limits", [{}, {"effort": 3.0}, {"velocity": 2.0}, {"effort": 0.0, "velocity": 2.0}])
+@pytest.mark.parametrize("ends", [{}, {"lower": -1.0}, {"upper": 2.0}, {"lower": -1.0, "upper": 2.0}])
+def test_pinocchio_and_mujoco_read_joints_with_any_of_the_limits(
+    kind: Any, limits: dict[str, Any], ends: dict[str, Any]
+) -> None:
+    ends = {} if kind == "continuous" else ends
+    body: dict[str, Any] = {"mass": 1.0, "inertia": np.eye(3)}
+    robot = Robot((Link("a", **body), Link("b", **body)), (Joint("j", kind, "a", "b", **limits, **ends),), "b")
+    text = robot.to_urdf()
+    peer = pinocchio.buildModelFromXML(text)
+    largest = np.finfo(float).max
+    assert [min(values[0], largest) for values in (peer.upperEffortLimit, peer.upperVelocityLimit)] == [
+        limits.get(name, largest) for name in ("effort", "velocity")
+    ]
+    if peer.nq == 1:  # a joint without position limits has a cosine and a sine
+        read = [peer.lowerPositionLimit[0], peer.upperPositionLimit[0]]
+        assert read == [ends.get("lower", -largest), ends.get("upper", largest)]
+    else:
+        assert not ends
+    assert mujoco.MjModel.from_xml_string(text).jnt_limited[0] == (kind == "prismatic" or bool(ends))
+    again = Robot.from_urdf(text).joints[0]
+    assert [getattr(again, name) for name in ("lower", "upper", "velocity", "effort")] == [
+        {**ends, **limits}.get(name, -np.inf if name == "lower" else np.inf)
+        for name in ("lower", "upper", "velocity", "effort")
+    ]
 
 
 def test_a_robot_is_written_to_a_file_as_a_whole_and_read_by_other_readers(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from models import Machine, Robot
 from ocp import Scene
 from ocp.app import Check, check_trajectory
-from ocp.app.check.joint_limits import limits_by_name
+from ocp.app.check.joint_limits import CHECKED_LIMITS, limits_by_name
 from ocp.app.check.verdict import CheckTolerances, Interpretation
 from ocp.app.files import RawTrajectory
 
@@ -87,7 +87,7 @@ def check_motion(machine: Machine | Robot, raw: RawTrajectory, **options: Any) -
     def group(*names: str) -> dict[str, Any]:
         return {name: options.pop(name) for name in names if name in options}
 
-    limits = group("velocity", "acceleration", "jerk", "torque")
+    limits = group(*CHECKED_LIMITS)
     by_name = {name: limits.pop(name) for name in [*limits] if isinstance(limits[name], dict)}
     bounds = replace(limits_by_name(robot, by_name), **limits, **group("friction"))
     interpretation = Interpretation(**group("rule", "time_unit", "unwrap", "names_confirmed"))

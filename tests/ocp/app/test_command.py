@@ -186,7 +186,7 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ('kind = "start"', "start = { elbw = 1 }", 12, "no independent joint 'elbw'"),
         ('kind = "start"', "start = { elbow = 1 }", 12, "start has no shoulder, wrist, slide"),
         ('kind = "start"', 'kind = "start"\nseed = -1', 13, "seed must be a whole number"),
-        ('shape = "box"', 'shape = "ball"', 15, 'one of "box", "sphere"'),
+        ('shape = "box"', 'shape = "ball"', 15, 'one of "sphere", "capsule"'),
         ("size = [0.1, 0.1, 0.1]", "size = [0.1, 0.1]", 16, "three lengths, m"),
         ("size = [0.1, 0.1, 0.1]", "size = [0.1, 0.1, -0.1]", 16, "positive"),
         ("[search]", "[serch]", 11, "did you mean search"),

@@ -251,10 +251,13 @@ def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_
 def test_costs_of_motions_that_are_not_solved_to_the_end_are_printed_as_estimates() -> None:
     plan = motion()
     for stage in (Stage.SEED, Stage.COARSE, Stage.FINE):
-        other = Candidate(START, 0.5 * plan.cost, Reason(Rejection.DUPLICATE), stage)
+        other = Candidate(START, 0.5 * plan.cost, Reason(Rejection.INFEASIBLE, "lost"), stage)
         first, second = str(replace(plan, candidates=(plan.candidates[0], other))).splitlines()[1:]
         assert "about" not in first
         assert ("about" in second) == (stage < Stage.FINE)
+        same = replace(other, reason=Reason(Rejection.DUPLICATE))
+        line = str(replace(plan, candidates=(plan.candidates[0], same))).splitlines()[2]
+        assert line.split()[0] == "-"  # an estimate says nothing about a motion that is known
 
 
 def test_failed_solutions_are_printed_without_cost() -> None:
@@ -262,7 +265,7 @@ def test_failed_solutions_are_printed_without_cost() -> None:
     report = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
     assert "3 to 4.5" in report
     assert "4 motions: the solver found no motion: lost" in report
-    assert "nan" in str(replace(motion(), candidates=tuple(lost[:1])))
+    assert str(replace(motion(), candidates=tuple(lost[:1]))).splitlines()[1].split()[0] == "-"
 
 
 def test_errors_at_a_prompt_take_one_line() -> None:

@@ -468,7 +468,7 @@ def test_reported_times_and_interpolants_belong_together() -> None:
         np.testing.assert_allclose(solution.costate_interpolant(places), lam, atol=1e-9)
 
 
-def test_the_told_durations_of_building_and_solving_are_parts_of_the_call() -> None:
+def test_the_reported_durations_of_building_and_solving_are_parts_of_the_call() -> None:
     began = time.monotonic()
     seconds = solve(energy(), Indirect()).seconds
     assert min(seconds.values()) > 0.0

@@ -196,6 +196,107 @@ def test_a_problem_that_is_split_is_the_same(symbols: tuple[Any, Any]) -> None:
     assert gradient == pytest.approx(whole.cost_gradient("gain"), rel=1e-4, abs=1e-6)
 
 
+# ---- costs at given times ----------------------------------------------------------------------------------------
+
+
+def decay(symbols: Any = ca.SX, **ends: Any) -> tuple[Problem, Any]:
+    """x' = -k x over 2 s with an unknown rate k."""
+    problem = Problem("decay", symbols)
+    x = problem.state("x", 1, guess=np.linspace(3.0, 1.0, 5)[:, None], **ends)
+    rate = problem.free_parameter("k", lower=0.0, guess=1.0)
+    problem.dynamics(x, -rate * x)
+    problem.horizon(2.0)
+    return problem, x
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+def test_parameters_are_estimated_from_data_at_given_times(symbols: Any) -> None:
+    """Data of an exact decay, also at both ends: the rate and the start are found, and no residual remains."""
+    problem, x = decay(symbols)
+    plan = solve(
+        Phases.with_costs_at(problem, {t: (x - 3.0 * np.exp(-0.7 * t)) ** 2 for t in (0.0, 0.3, 1.1, 2.0)}),
+        Collocation(4, 4),
+    )
+    assert plan["k"][0, 0] == pytest.approx(0.7, abs=1e-6)
+    assert plan.phase("p0")["x"][0, 0] == pytest.approx(3.0, abs=1e-6)
+    assert plan.cost == pytest.approx(0.0, abs=1e-10)
+    assert plan.phases == {"p0": (0.0, 0.3), "p1": (0.3, 1.1), "p2": (1.1, 2.0)}
+    assert set(plan.states) == {"p0.x", "p1.x", "p2.x", "k"}
+    assert plan.audit().passed
+
+
+def test_a_cost_at_a_time_makes_the_costate_jump_by_its_slope() -> None:
+    """x' = u from 0, least int u^2 / 2 dt + w (x(a) - 1)^2 / 2: u = w / (1 + w a) up to a, and rest after it."""
+    weight, at, total = 6.0, 0.4, 1.5
+    problem = Problem("hit")
+    x, u = problem.state("x", initial=0.0), problem.control("u")
+    problem.dynamics(x, u)
+    problem.horizon(total)
+    problem.minimize(running=u**2 / 2)
+    plan = solve(Phases.with_costs_at(problem, {at: weight / 2 * (x - 1) ** 2}), Collocation(5))
+    push = weight / (1 + weight * at)
+    assert plan.cost == pytest.approx(push / 2, rel=1e-8)
+    assert plan.phase("p0").costate("x") == pytest.approx(-push, rel=1e-6)
+    assert plan.phase("p1").costate("x") == pytest.approx(0.0, abs=1e-6)
+    assert plan.audit().passed
+
+
+@pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
+def test_costs_of_zero_at_times_change_nothing(symbols: Any) -> None:
+    """Times, the horizon, values at the start, guesses and parameters keep their meaning in every phase."""
+    problem = Problem("swing", symbols)
+    gain = problem.parameter("gain")
+    x = problem.state("x", 2, initial=[1.0, nan], upper=gain, guess=lambda t: [1 - t, 0.0])
+    u = problem.control("u", upper=gain, lower=-2.0)
+    T = problem.horizon(2.0)
+    problem.dynamics(x, ca.vertcat(x[1], -gain * x[0] + u + 0.3 * ca.sin(2 * problem.time) + 0.1 * T))
+    problem.path("sum", x[0] + x[1] + 0.1 * problem.time, upper=1.4)
+    problem.start("begin", x[1] + u, lower=-5.0, upper=0.5)
+    problem.end("closed", x[1] - problem.at_start(x)[1], 0.0, 0.0)
+    problem.minimize(running=u**2 * (1 + problem.time), terminal=x[0] ** 2 + problem.time * problem.at_start(x)[1] ** 2)
+    options: Any = {"parameters": {"gain": 1.5}}
+    whole = solve(problem, Collocation(12, 4), **options)
+    phases = Phases.with_costs_at(problem, {0.7: 0 * x[0], 1.2: 0})
+    plan = solve(phases, Collocation(6, 4), **options)
+    assert plan.cost == pytest.approx(whole.cost, rel=1e-6)
+    for name, (begin, _) in plan.phases.items():
+        part = plan.phase(name)
+        at = np.linspace(0.0, part.horizon, 5)
+        assert part.at(at)["x"] == pytest.approx(whole.at(begin + at)["x"], abs=1e-4)
+    assert plan.cost_gradient("gain") == pytest.approx(whole.cost_gradient("gain"), rel=1e-4)
+    assert plan.audit().feasible
+
+
+def test_a_shared_free_parameter_is_one_that_is_joined() -> None:
+    problem, x = decay(initial=1.0)
+    cost = (x - 0.4) ** 2
+    shared = solve(Phases.with_costs_at(problem, {1.0: cost, 2.0: cost}), Collocation(4))
+    legs = {}
+    for name in ("a", "b"):
+        legs[name], x = decay(initial=1.0 if name == "a" else None)
+        legs[name].declared.horizon = None
+        legs[name].horizon(1.0)
+        legs[name].minimize(terminal=(x - 0.4) ** 2)
+    joined = Phases("joined", legs)
+    joined.join("a", "b")
+    other = solve(joined, Collocation(4))
+    assert shared.cost == pytest.approx(other.cost, rel=1e-8)
+    assert shared["k"][0] == pytest.approx(other["a.k"][0], rel=1e-5)
+
+
+def test_costs_at_times_that_do_not_fit_are_refused() -> None:
+    problem, x = decay()
+    with pytest.raises(ProblemError, match=r"costs at \[2.5\] s do not fit its horizon, 2.0 s"):
+        Phases.with_costs_at(problem, {2.5: x})
+    with pytest.raises(ProblemError, match="scalar"):
+        Phases.with_costs_at(problem, {1.0: ca.vertcat(x, x)})
+    with pytest.raises(ProblemError, match="'x' is no free parameter"):
+        Phases("shared", {"a": problem}, shared=["x"])
+    problem.watch("room", x, upper=5.0)
+    with pytest.raises(ProblemError, match="no signals, watches"):
+        Phases.with_costs_at(problem, {1.0: x})
+
+
 def fast(first: bool, last: bool) -> Problem:
     problem = Problem("fast")
     x = problem.state("x", initial=0.0 if first else None, terminal=1.0 if last else None)

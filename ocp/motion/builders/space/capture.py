@@ -301,7 +301,7 @@ class _Capture:
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
     def approach(self, clearance_constraints: ClearanceConstraints | None) -> Problem:
-        """Declare the problem of the approach, with the pose of the target as a state and the cone as a constraint."""
+        """Declare the problem of the approach, with the target's pose as a state and the tip confined to a cone."""
         chaser, target, duration, start = self.chaser, self.capture.target, self.capture.approach, self.start
         setup = DynamicsSetup(
             start_velocity=start.velocities,

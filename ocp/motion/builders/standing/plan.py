@@ -342,7 +342,7 @@ def _attempts(
     *,
     diagnosed: bool,
 ) -> Iterator[tuple[str, Attempt]]:
-    """Yield attempts by name on finer and finer meshes; the caller stops at an accepted one.
+    """Solve and audit a problem on finer and finer meshes; yield a name and the result of each solve.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """

@@ -182,14 +182,9 @@ def _declare_phase(
 
 
 def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> JointBounds:
-    """Return the limits of joints and actuators by name, reordered from the robot's joint order to that of a stance."""
-    order = steps.order(stance)
-    bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
-    for name in bounds:
-        explicit = getattr(limits, name, None) if name not in ("lower", "upper") else None
-        if explicit is not None and np.size(explicit) != 1:
-            bounds[name] = np.asarray(explicit, dtype=float).ravel()[order]
-    return JointBounds(**bounds)
+    """Return the limits of joints and actuators, reordered from the robot's joint order to that of a stance."""
+    limits.bounds(stance)  # checks the number of their entries
+    return limits.of_joints(steps.order(stance)).bounds(stance, ("velocity", "torque"))
 
 
 def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:

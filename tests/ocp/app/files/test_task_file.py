@@ -33,6 +33,7 @@ from ocp import (
 )
 from ocp.__main__ import main
 from ocp.app.files.task_file import Task, read_task
+from ocp.motion.tasks.goals import TERMS
 from scripts.robots.steps import planar_biped
 from tests.ocp.app.motions import NAMES, write_robot
 from tests.ocp.motion.builders.captures import PLANAR_START, planar_capture, planar_chaser, planar_target
@@ -87,6 +88,13 @@ def test_a_goal_may_be_a_region(tmp_path: Path, text: str, kind: Any, size: Any)
     assert isinstance(goal.region, kind)
     np.testing.assert_allclose(goal.region.size if kind is Box else goal.region.radius, size)
     np.testing.assert_allclose(goal.region.position, [0.7, 0, 0.3])
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_a_task_file_weights_every_term_of_the_cost(tmp_path: Path, term: str) -> None:
+    cost = read(tmp_path, f"[path]\n{PATH}[cost]\n{term} = 1.0\n").options["cost"]
+    assert np.all(np.asarray(getattr(cost, term)) == 1.0)
+    assert set(cost.terms) <= {"velocity", term}
 
 
 def test_waypoints_sequences_costs_and_horizons_are_those_of_plan(tmp_path: Path) -> None:
@@ -163,7 +171,7 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, expected: st
 
 def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
     with pytest.warns(ModelWarning, match="is it in millimetres"):
-        read(tmp_path, "[path]\npoints = [[400, -200, 300], [400, 100, 300]]\nspeed = 50\n")
+        read(tmp_path, "[path]\npoints = [[400, -200, 300], [400, 100, 300]]\nspeed = 50\nsteady = true\n")
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:

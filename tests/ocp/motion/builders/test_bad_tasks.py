@@ -72,6 +72,7 @@ from ocp import (
 from ocp.motion.builders.dynamics_plan import SolveSettings
 from ocp.motion.builders.space.capture import solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
+from ocp.motion.tasks.goals import TERMS
 from ocp.motion.tasks.tracks import path_tracks, pose_line
 from tests.bad_values import (
     CALLABLE,
@@ -457,21 +458,7 @@ def moved(**options: Any) -> Problem:
 FRICTION = {"negative": -1.0, "nan": NAN, "inf": INF, "text": "much", "empty": []}
 DYNAMICS = [
     Case("JointFriction", JointFriction, {}, {"viscous": FRICTION, "coulomb": FRICTION, "slip": POSITIVE}),
-    Case(
-        "Cost",
-        Cost,
-        {"time": 1.0},
-        {
-            "velocity": NONNEGATIVE,
-            "effort": FRICTION,
-            "length": NONNEGATIVE,
-            "energy": NONNEGATIVE,
-            "acceleration": NONNEGATIVE,
-            "jerk": NONNEGATIVE,
-            "turning": NONNEGATIVE,
-            "time": NONNEGATIVE,
-        },
-    ),
+    Case("Cost", Cost, {"time": 1.0}, {**dict.fromkeys(TERMS, NONNEGATIVE), "effort": FRICTION}),
     Case(
         "dynamics_problem",
         moved,

@@ -21,11 +21,14 @@ from models import (
     FreeFloating,
     HalfSpace,
     Machine,
+    Mesh,
     MovingObstacle,
     Sphere,
 )
-from ocp.motion.local.collisions import distances_along
+from ocp.motion.local.collisions import distances_along, largest_changes
 from tests.models.robot.trees import random_robot
+from tests.ocp.motion.tasks.space_tasks import panda
+from tests.redundancy_benchmark import problem_of
 
 SIZES = {"sphere": (0.08,), "capsule": (0.05, 0.3), "box": (0.1, 0.2, 0.3), "cylinder": (0.06, 0.3)}
 
@@ -102,6 +105,62 @@ def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[CollisionS
         np.testing.assert_allclose(
             result[:, pairs].T, np.hstack([np.array(known(*one)[0]) for one in samples]), atol=1e-9
         )
+
+
+def limited_crowd(seed: int) -> CollisionScene:
+    """The same among fixed obstacles, with slides that move by at most five metres from zero."""
+    around = crowd(seed)
+    robot = around.machine.robot
+    limited = [replace(joint, lower=-5.0, upper=5.0) if joint.kind == "prismatic" else joint for joint in robot.joints]
+    return CollisionScene(FixedBase(replace(robot, joints=tuple(limited))), around.obstacles[:-1])
+
+
+def crowded_panda() -> CollisionScene:
+    """A Panda, whose links have meshes that smaller shapes cover, among boxes."""
+    return CollisionScene(panda(), [Box((0.2, 0.3, 0.4), (0.4, 0.3, 0.5)), Box((0.3, 0.2, 0.2), (-0.2, 0.1, 0.9))])
+
+
+@pytest.mark.parametrize("seed", [*range(12), None])
+@pytest.mark.parametrize("size", [1, 2])
+def test_distances_change_no_more_than_bounded(seed: int | None, size: int) -> None:
+    """From the middle of boxes of displacements to random points and corners of them, of all pairs, near and far.
+
+    The depths of overlapping cylinders and meshes are estimates, of which nothing follows.
+    """
+    around, rng = crowded_panda() if seed is None else limited_crowd(seed), np.random.default_rng(seed)
+    robot, hulls = around.machine.robot, [type(body.shape) for body in around.bodies]
+    estimated = np.array([bool({hulls[k] for k in pair[:2]} & {Cylinder, Mesh}) for pair in around.pairs])
+    n, count = robot.dof, 8
+    middle = rng.uniform(np.maximum(robot.lower, -2.0) + 0.5, np.minimum(robot.upper, 2.0) - 0.5, (count, n))
+    tangents = np.linalg.qr(rng.normal(size=(count, n, min(size, n))))[0]
+    reach, rest = 10 ** rng.uniform(-3, -0.5, tangents.shape[::2]), 10 ** rng.uniform(-5, -2, (count, n))
+    at, pair = (index.ravel() for index in np.indices((count, len(around.pairs))))
+    bounds = largest_changes(around, middle, at, pair, box=(tangents, reach, rest)).reshape(count, -1)
+    first = distances_along(around, np.zeros(0), middle, np.zeros(count))
+    for k in range(20):
+        shares = rng.uniform(-1, 1, (2, count, n)) if k % 2 else rng.choice([-1.0, 1.0], (2, count, n))
+        moved = middle + np.einsum("kna,ka->kn", tangents, reach * shares[0][:, : tangents.shape[2]])
+        last = distances_along(around, np.zeros(0), moved + rest * shares[1], np.zeros(count))
+        exact = np.where(estimated, np.minimum(first, last) >= 0, True)
+        assert (np.abs(last - first) <= bounds + 1e-9)[exact].all()
+
+
+def test_a_self_motion_that_leaves_the_hand_in_place_changes_its_distances_to_second_order() -> None:
+    """Of a Panda whose links are capsules. Levers would add the speeds of all joints up."""
+    problem = problem_of("panda__flappy_bird")
+    around = CollisionScene(problem.machine, problem.boxes, ignored=problem.ignored)
+    q, symbols = np.array([[0.3, -0.5, 0.2, -2.0, 0.4, 1.8, 0.5]]), ca.SX.sym("q", 7)
+    pose = problem.machine.tip_pose((), symbols)
+    columns = ca.vertcat(pose.position, ca.vec(pose.rotation))
+    tangent = np.linalg.svd(np.array(ca.Function("rates", [symbols], [ca.jacobian(columns, symbols)])(q[0])))[2][-1]
+    pair = np.array([around.labels.index(("panda_hand", "obstacle 0"))])
+    for reach, share in ((1e-3, 0.01), (0.1, 1.0)):
+        box = tangent[None, :, None], np.full((1, 1), reach), np.zeros((1, 7))
+        bound = largest_changes(around, q, np.zeros(1, dtype=int), pair, box=box)[0]
+        ends = q + np.outer((0.0, -reach, reach), tangent)
+        distances = distances_along(around, np.zeros(0), ends, np.zeros(3))[:, pair[0]]
+        assert 0 < np.abs(distances - distances[0]).max() <= bound
+        assert bound < share * reach * float(around.levers.joints[pair[0]] @ np.abs(tangent))
 
 
 def test_values_that_are_no_numbers_stay_undefined(few: tuple[CollisionScene, list[int], Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,22 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Link, Machine, planar_chain
+from models import (
+    FixedBase,
+    FreeFloating,
+    Link,
+    Machine,
+    example_robot,
+    inverse_dynamics,
+    planar_chain,
+    smooth,
+    with_load,
+)
+from models import Path as CornerPath
 from models.checks import Array
 from ocp import Limits, Plan, SolveError, TipTask, plan
 from ocp.__main__ import main
+from ocp.app.files import read_waypoints
 from ocp.motion.plan.actuators import largest_demand
 from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot
@@ -23,6 +36,7 @@ LENGTHS, MASSES = [0.5, 0.4, 0.3], [2.0, 1.5, 1.0]
 START = np.array([0.4, 0.9, -0.6])
 SECONDS = 1.5
 FIXED = FixedBase(planar_chain(LENGTHS, MASSES))
+SIX_AXIS = FixedBase(example_robot("six_axis"))
 FLOATING = FreeFloating(planar_chain(LENGTHS, MASSES, base=Link("base", 8.0, (0, 0, 0), 0.5 * np.eye(3))), "planar")
 
 
@@ -89,6 +103,93 @@ def test_infeasible_tasks_are_named_with_their_requirement() -> None:
     assert (caught.value.name, caught.value.limit) == ("joint1", 0.05)
     assert caught.value.value > 1.0
     assert 0 < caught.value.time < SECONDS
+
+
+def limited(quantity: str, most: Any) -> Limits:
+    return replace(Limits(), **{quantity: most})
+
+
+def line_task(acceleration: float = 0.5, jerk: float = 4.0) -> TipTask:
+    """Along y with a free roll about the last axis of the arm, so that the task determines all other joints."""
+    path = smooth(CornerPath.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3)]), 0.002)
+    return TipTask.along(path, 0.1, acceleration=acceleration, jerk=jerk, direction=(0, 0, -1))
+
+
+@pytest.mark.parametrize("quantity", ["acceleration", pytest.param("jerk", marks=pytest.mark.long)])
+def test_limits_below_what_a_task_determines_are_refused_with_its_demand(quantity: str) -> None:
+    """At the limit of the demand itself the motion is planned, and it is the motion without limits."""
+    task = line_task()
+    free = plan(SIX_AXIS, task, search="start")
+    sample, start = free.sample(5e-4), free.at(0.0)["joints"]
+    values = sample.accelerations
+    if quantity == "jerk":
+        values = np.gradient(values, sample.t, axis=0)
+    joint = int(np.abs(values).max(axis=0).argmax())
+    most = float(np.abs(values[:, joint]).max())
+    with pytest.raises(SolveError, match="the tasks determine the motion of this joint: lower the speed") as caught:
+        plan(SIX_AXIS, task, start=start, limits=limited(quantity, 0.9 * most))
+    error = caught.value
+    assert (error.name, error.limit) == (free.names[joint], pytest.approx(0.9 * most))
+    assert error.value == pytest.approx(most, rel=0.01)
+    assert np.abs(values[np.abs(sample.t - error.time) < 0.02, joint]).max() > 0.9 * most
+    result = plan(SIX_AXIS, task, start=start, limits=limited(quantity, 1.02 * most))
+    assert result.audit().passed
+    assert result.cost == pytest.approx(free.cost, rel=1e-4)
+    with pytest.raises(SolveError, match="the tasks determine"):
+        plan(SIX_AXIS, task, start=start, limits=limited(quantity, np.where(np.arange(6) == joint, 0.5, 1e3)))
+
+
+def test_a_payload_that_the_arm_cannot_hold_at_rest_is_refused_with_the_torque_there() -> None:
+    """Its weight times its lever about the second axis of the arm, beside the weight of the arm itself."""
+    arm = example_robot("six_axis")
+    loaded = with_load(arm, arm.tip_link, 40.0, arm.tip_translation)
+    start = plan(SIX_AXIS, line_task(), search="start").at(0.0)["joints"]
+    with pytest.raises(SolveError, match="the arm must hold itself at rest there: reduce its load") as caught:
+        plan(FixedBase(loaded), line_task(), start=start, limits=Limits(torque=arm.effort))
+    error, zeros = caught.value, np.zeros(6)
+    ends = [inverse_dynamics(loaded, q, zeros, zeros) for q in (start, plan_end(start))]
+    static = np.abs([np.array(ca.DM(torques)).ravel() for torques in ends])
+    joint = arm.joint_names.index(str(error.name))
+    assert (static / arm.effort).max() == pytest.approx(error.value / error.limit)
+    assert static[:, joint].max() == pytest.approx(error.value)
+    assert error.time in (0.0, line_task().duration)
+
+
+def plan_end(start: Array) -> Array:
+    """Last configuration of the motion along the line from a start."""
+    result = plan(SIX_AXIS, line_task(), start=start)
+    return np.asarray(result.at(result.horizon)["joints"])
+
+
+@pytest.mark.long
+def test_joints_at_rest_have_no_acceleration_if_their_jerk_is_limited() -> None:
+    """An acceleration that jumps at the start or at the end is an unlimited jerk there."""
+    free = plan(FIXED, smooth_task(FIXED), start=START)
+    result = plan(FIXED, smooth_task(FIXED), start=START, limits=Limits(jerk=200.0))
+    assert result.audit().passed
+    for name in ("velocities", "accelerations"):
+        np.testing.assert_allclose(result.solution[name][[0, -1]], 0.0, atol=1e-4)
+    assert np.abs(result.solution["jerks"]).max() <= 200.0 * (1 + 1e-6)
+    assert free.cost <= result.cost < 1.1 * free.cost
+
+
+@pytest.mark.long
+def test_a_seam_of_many_poses_is_planned_within_accelerations_and_jerks(tmp_path: Path) -> None:
+    """On a pipe that stands on a wider one, given by 200 poses in millimetres, from rest to rest."""
+    angle = np.linspace(-0.8 * np.pi, 0.8 * np.pi, 200)
+    x, y = 500 + 60 * np.cos(angle), 60 * np.sin(angle)
+    axes = np.column_stack([-0.5 * np.cos(angle), -0.5 * np.sin(angle), -0.85 + 0 * angle])
+    axes /= np.linalg.norm(axes[0])
+    seam = np.column_stack([x, y, 150 + np.sqrt(120**2 - y**2) - 120, axes])
+    np.savetxt(tmp_path / "seam.csv", seam, delimiter=",", header="x [mm],y [mm],z [mm],ax,ay,az", comments="")
+    task = TipTask.along(read_waypoints(tmp_path / "seam.csv").smooth(0.0005), 0.01)
+    result = plan(SIX_AXIS, task, limits=Limits(acceleration=8.0, jerk=100.0))
+    assert result.audit().passed
+    sample = result.sample(0.001)
+    assert np.abs(sample.accelerations).max() <= 8.0
+    assert (np.abs(np.diff(sample.accelerations, axis=0)) / 0.001).max() <= 100.0 * (1 + 1e-3)
+    np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
+    np.testing.assert_allclose(sample.accelerations[[0, -1]], 0.0, atol=1e-4)
 
 
 def test_a_task_file_limits_torques_and_the_check_agrees(tmp_path: Path, capsys: Any) -> None:

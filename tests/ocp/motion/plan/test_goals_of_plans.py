@@ -162,6 +162,9 @@ def test_the_problem_of_a_motion_has_its_cost() -> None:
     problem = plan_problem(arm(), task, start=START, scene=False)
     own = solve(problem, Collocation(12, degree=4))
     assert own.cost == pytest.approx(plan(arm(), task, start=START, scene=False).cost, rel=1e-4)
+    with pytest.raises(ProblemError, match=r"Cost\(velocity=1.0, effort=1.0\)") as refused:
+        plan_problem(arm(), task, start=START, cost=Cost(effort=1.0), scene=False)
+    assert refused.value.name == "cost"
     several = plan_problem(
         arm(), [Goal(joints=END, duration=1.0), Goal(joints=START, duration=1.0)], start=START, scene=False
     )

@@ -46,14 +46,14 @@ def test_rates_are_those_of_the_tasks_and_of_their_null_space() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-10])
-def test_pose_errors_are_corrected_to_the_tolerance_and_told(tolerance: float) -> None:
+def test_pose_errors_are_corrected_to_the_tolerance_and_reported(tolerance: float) -> None:
     own = kinematics(np.zeros(3))
     base, joints = states(20, 0.02)
     before = np.abs(own.at(base, joints, 0.0).error).max(axis=1)
     assert before.min() > 1e-3
-    _, corrected, told = own.correct_poses(base, joints, 0.0, tolerance, max_steps=8)
-    assert told.max() <= tolerance
-    np.testing.assert_allclose(told, np.abs(own.at(base, corrected, 0.0).error).max(axis=1), atol=1e-15)
+    _, corrected, reported = own.correct_poses(base, joints, 0.0, tolerance, max_steps=8)
+    assert reported.max() <= tolerance
+    np.testing.assert_allclose(reported, np.abs(own.at(base, corrected, 0.0).error).max(axis=1), atol=1e-15)
     moved = (corrected - joints) * own.root
     along_null = own.at(base, corrected, 0.0).null_rates(moved)
     assert np.linalg.norm(along_null, axis=1).max() < 0.1 * np.linalg.norm(moved, axis=1).min()
@@ -64,10 +64,10 @@ def test_a_bounded_number_of_corrections_is_made() -> None:
     base, joints = states(20, 0.05)
     errors = []
     for steps in range(4):
-        _, corrected, told = own.correct_poses(base, joints, 0.0, 0.0, max_steps=steps)
-        np.testing.assert_allclose(told, np.abs(own.at(base, corrected, 0.0).error).max(axis=1), atol=1e-15)
+        _, corrected, reported = own.correct_poses(base, joints, 0.0, 0.0, max_steps=steps)
+        np.testing.assert_allclose(reported, np.abs(own.at(base, corrected, 0.0).error).max(axis=1), atol=1e-15)
         assert steps or (corrected == joints).all()
-        errors.append(told.max())
+        errors.append(reported.max())
     assert errors[3] < 1e-2 * errors[0]
 
 
@@ -78,10 +78,10 @@ def test_a_step_follows_the_task_and_adds_self_motion() -> None:
     for duration in (0.2, 0.1):
         task = own.at(base, joints, 0.0)
         rates = task.least_rates(task.right) + task.null_rates(np.full((1, 7), 0.3))
-        _, after, told = own.step(base, joints, task, rates, interval=(0.0, duration), tolerance=1e-9)
+        _, after, reported = own.step(base, joints, task, rates, interval=(0.0, duration), tolerance=1e-9)
         start, tip = (numeric(ARM.tip_pose((), each).position).ravel() for each in (JOINTS, after[0]))
         np.testing.assert_allclose(tip, start + velocity * duration, atol=1e-8)
-        assert told.max() <= 1e-9
+        assert reported.max() <= 1e-9
         self_motion = task.null_rates((after - joints) * own.root / duration)
         assert np.abs(self_motion - task.null_rates(rates)).max() < 0.5 * duration
 

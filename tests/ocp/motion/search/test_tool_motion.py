@@ -1,0 +1,109 @@
+"""What a path through tool poses costs at least, by the motion of the tool alone, whatever joints an arm has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from models import FixedBase, Joint, Link, Robot
+from models.checks import Array
+from models.robot.parts import Kind
+from models.robot.rebuild import lock_joints, mount_on_rail
+from ocp import Limits, ProblemError, Waypoints, plan
+from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.shortening import PathPoses
+from ocp.motion.search.task_search import tool_motion_bound
+from tests.models.robot.trees import random_robot
+from tests.ocp.motion.plan.test_waypoints import poses
+from tests.ocp.motion.tasks.space_tasks import PANDA_START, panda_arm
+
+COSTS = (PathLength, LargestMotion)
+
+
+def at_tip(machine: FixedBase, path: Array) -> PathPoses:
+    """The poses of the tip along a joint path."""
+    tips = [machine.tip_pose((), q) for q in path]
+    positions = np.array([np.array(ca.DM(tip.position)).ravel() for tip in tips])
+    return PathPoses(positions, np.array([np.array(ca.DM(tip.rotation)) for tip in tips]), np.ones(path.shape[1]))
+
+
+def bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous) -> float:
+    return tool_motion_bound(machine, poses, cost, Limits().bounds(machine))
+
+
+def random_arm(seed: int, size: int = 7) -> FixedBase:
+    """A tree of joints that turn, slide and follow others."""
+    robot = random_robot(np.random.default_rng(seed), size, followers=True)
+    joints = [replace(each, lower=-6.0, upper=6.0) if each.kind == "prismatic" else each for each in robot.joints]
+    return FixedBase(replace(robot, joints=tuple(joints)))
+
+
+def joint_path(machine: FixedBase, rng: np.random.Generator, count: int = 9) -> Array:
+    """A random walk within the limits."""
+    n = machine.joint_size
+    low, high = np.maximum(machine.robot.lower, -2.0), np.minimum(machine.robot.upper, 2.0)
+    start = low + rng.uniform(0.3, 0.7, n) * (high - low)
+    return np.asarray(np.clip(start + np.cumsum(rng.normal(scale=0.1, size=(count, n)), axis=0), low, high))
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("kind", COSTS)
+def test_no_joint_path_costs_less(seed: int, kind: type[Homogeneous]) -> None:
+    """Nor does a bound through fewer of the poses exceed that through all; joints that cost nothing may be there."""
+    machine, rng = random_arm(seed), np.random.default_rng(seed)
+    weights = rng.uniform(0.2, 2.0, machine.joint_size) * (rng.random(machine.joint_size) < 0.8)
+    path, cost = joint_path(machine, rng), kind(np.maximum(weights, 1e-3 * (seed % 2)))
+    positions, rotations, step = at_tip(machine, path)
+    least = bound(machine, PathPoses(positions, rotations, step), cost)
+    assert 0.0 <= least <= cost.evaluate(np.diff(path, axis=0), 1.0).sum() * (1 + 1e-9)
+    assert bound(machine, PathPoses(positions[::2], rotations[::2], step), cost) <= least * (1 + 1e-9)
+    assert bound(machine, PathPoses(positions[::-1], rotations[::-1], step), cost) == pytest.approx(least, rel=1e-9)
+    assert bound(machine, PathPoses(positions, rotations, step), kind(3 * cost.weights)) == pytest.approx(3 * least)
+
+
+@pytest.mark.parametrize("kind", COSTS)
+def test_a_locked_joint_never_lowers_the_bound(kind: type[Homogeneous]) -> None:
+    robot = mount_on_rail(panda_arm(), (0, 1, 0), -1.0, 1.0)
+    whole, rng = FixedBase(robot), np.random.default_rng(3)
+    for name in robot.joint_names[:5]:
+        held = FixedBase(lock_joints(robot, {name: 0.4}))
+        tips = at_tip(held, joint_path(held, rng))
+        assert bound(held, tips, kind(np.ones(7))) >= bound(whole, tips, kind(np.ones(8))) * (1 - 1e-9) > 0
+
+
+@pytest.mark.parametrize("kind", ["prismatic", "revolute"])
+def test_of_a_single_joint_the_bound_is_exact(kind: Kind) -> None:
+    joint = Joint("joint", kind, "base", "tool", (0.1, 0.0, 0.3), axis=(0.0, 0.6, 0.8), lower=-3.0, upper=3.0)
+    machine = FixedBase(Robot((Link("base"), Link("tool")), (joint,), "tool", (0.3, -0.2, 0.1)))
+    path = joint_path(machine, np.random.default_rng(5))
+    for each in COSTS:
+        cost = each(np.array([1.7]))
+        length = cost.evaluate(np.diff(path, axis=0), 1.0).sum()
+        assert bound(machine, at_tip(machine, path), cost) == pytest.approx(length, rel=1e-6)
+
+
+@pytest.mark.long
+def test_a_path_of_three_redundant_joints_costs_no_more_than_with_one_held_and_has_a_bound() -> None:
+    held = FixedBase(mount_on_rail(panda_arm(), (0, 1, 0), -1.0, 1.0))
+    machine = FixedBase(mount_on_rail(held.robot, (1, 0, 0), -0.5, 0.5, name="gantry"))
+    places, turns = poses(machine, np.append((0.0, 0.0), PANDA_START), 9)
+    result, other = (plan(each, Waypoints(places, turns), scene=False) for each in (machine, held))
+    assert isinstance(result, PathPlan)
+    assert result.bound is not None
+    assert 0 < result.bound <= result.cost <= other.cost * (1 + 1e-3)
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in result.joints]
+    assert np.array(tips) == pytest.approx(places, abs=1e-6)
+
+
+def test_four_redundant_joints_are_refused() -> None:
+    robot = panda_arm()
+    for name, axis in (("rail", (0, 1, 0)), ("gantry", (1, 0, 0)), ("lift", (0, 0, 1))):
+        robot = mount_on_rail(robot, axis, -0.5, 0.5, name=name)
+    machine = FixedBase(robot)
+    places, turns = poses(machine, np.append((0.0, 0.0, 0.0), PANDA_START), 5)
+    with pytest.raises(ProblemError, match="at most 3 degrees of freedom"):
+        plan(machine, Waypoints(places, turns), scene=False)
