@@ -271,10 +271,7 @@ class NumericDerivatives:
 
 
 class ArrayFunction:
-    """A casadi Function of dense vectors whose outputs are written directly into NumPy arrays.
-
-    If `kept`, all calls share a work space, which takes more memory than the outputs: only one thread may call it.
-    """
+    """A casadi Function of dense vectors with NumPy arrays as outputs; for one thread if its work space is `kept`."""
 
     def __init__(self, function: Any, *, kept: bool = False) -> None:
         self._function = function
