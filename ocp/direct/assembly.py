@@ -271,36 +271,39 @@ class NumericDerivatives:
 
 
 class ArrayFunction:
-    """A casadi Function of dense vectors whose outputs are written directly into NumPy arrays."""
+    """A casadi Function of dense vectors with NumPy arrays as outputs; for one thread if its work space is `kept`."""
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, *, kept: bool = False) -> None:
         self._function = function
         patterns = [function.sparsity_out(i) for i in range(function.n_out())]
         self._sizes, self._shapes = [each.nnz() for each in patterns], [each.shape for each in patterns]
         self._indices = [
             tuple(np.array(part, dtype=np.int32) for part in (each.row(), each.colind())) for each in patterns
         ]
+        self._kept = self._allocate() if kept else None
+
+    def _allocate(self) -> tuple[Any, Any, list[np.ndarray], list[np.ndarray]]:
+        """Return a buffer with its work space, the call that evaluates it, and the arrays of inputs and outputs."""
+        buffer, run = self._function.buffer()
+        inputs = [np.zeros(self._function.nnz_in(i)) for i in range(self._function.n_in())]
+        outputs = [np.zeros(size) for size in self._sizes]
+        for pass_pointer, arrays in ((buffer.set_arg, inputs), (buffer.set_res, outputs)):
+            for i, each in enumerate(arrays):
+                pass_pointer(i, each.data)
+        return buffer, run, inputs, outputs
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Evaluate the function; outputs with one column are returned as arrays, other outputs as sparse matrices.
-
-        Raises:
-            RuntimeError: The evaluation fails, for example in an integrator.
-        """
-        buffer, run = self._function.buffer()  # not kept: its work space takes more memory than its outputs
-        outputs = [np.zeros(size) for size in self._sizes]
-        inputs = [np.ascontiguousarray(each, dtype=float).ravel() for each in arguments]
-        for i, each in enumerate(inputs):
-            buffer.set_arg(i, each.data)
-        for i, each in enumerate(outputs):
-            buffer.set_res(i, each.data)
+        """Return columns as arrays, other outputs as sparse matrices; raise RuntimeError if the evaluation fails."""
+        buffer, run, inputs, outputs = self._kept or self._allocate()
+        for own, each in zip(inputs, arguments, strict=True):
+            own[:] = each.ravel()
         run()
         if buffer.ret():
             raise RuntimeError(f"{self._function.name()} cannot be evaluated")
         return [
-            dense_column(data, index[0], shape[0])
+            dense_column(data.copy() if self._kept else data, index[0], shape[0])
             if shape[1] == 1
-            else scipy.sparse.csc_array((data, *index), shape=shape)
+            else scipy.sparse.csc_array((data, *index), shape=shape, copy=bool(self._kept))
             for data, index, shape in zip(outputs, self._indices, self._shapes, strict=True)
         ]
 

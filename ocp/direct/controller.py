@@ -123,7 +123,8 @@ class Controller:
             keys, names = [function_key(f) for f in functions], [f.name() for f in functions]
             functions = ProgramFunctions(*compile_functions(keys, names, lambda: self._functions))
         self._solver, function = self._build(functions)
-        self._run, self._bounds = ArrayFunction(function), ArrayFunction(prepared.formulation.bounds.function)
+        bounds = prepared.formulation.bounds.function
+        self._run, self._bounds = ArrayFunction(function, kept=True), ArrayFunction(bounds, kept=True)
         self.reset(plan)
 
     def reset(self, plan: Solution) -> None:
@@ -163,7 +164,7 @@ class Controller:
         form, tolerance = self._prepared.formulation, self.settings.tolerance
         p = form.parameter_vector(require.mapping("parameters", parameters))
         lower, upper = self._bounds(p)
-        if not np.all(lower <= upper):
+        if not (lower <= upper).all():
             form.bound_values(p)  # raises an error that names the bound
         shift = np.array([0.0 if self._is_first else 1.0])
         measures = np.full(len(MEASURES), np.inf)
@@ -172,7 +173,7 @@ class Controller:
             measures = np.concatenate([values[name] for name in MEASURES])
         except RuntimeError:  # a function of the problem is not finite, or cannot be evaluated
             values = self._last
-        held = not np.all(np.isfinite(measures))
+        held = not np.isfinite(measures).all()
         if held and not self._last:
             words = f"controller: a function of problem {form.name!r} is not finite at these parameters, and no earlier"
             raise SolveError(f"{words} step can be held; start again from a plan: reset(plan)", name=form.name)
@@ -182,7 +183,7 @@ class Controller:
             self._state, self._last = (values["x"], values["lam_x"], values["lam_g"]), values
         self._is_first = False
         iterations = int(self._solver.stats(1)["iter_count"])
-        converged = bool(np.all(measures <= tolerance))
+        converged = bool((measures <= tolerance).all())
         outcome = Outcome(
             values["x"],
             float(values["cost"][0]),

@@ -53,10 +53,10 @@ class SplineSettings:
     # number of points of a path to which targets are compared, to find those that belong to the path
     path_samples: int = 200
     projections: int = 8  # number of Newton steps by which targets are projected onto the path
-    segment_samples: int = 12  # least number of samples of a plan in each segment of the path
+    # least number of samples of a plan in each segment of the path: the third derivative of a blend is then within
+    # some percent, and the duration of a motion, which depends on its cube root, within 1e-3
+    segment_samples: int = 24
     batch: int = 1024  # number of path points whose torques are computed together
-    few: int = 300  # number of path points below which casadi computes the torques sooner than NumPy does for a batch
-    points: int = 32  # number of path points of one such call
 
 
 SPLINE = SplineSettings()
@@ -139,7 +139,7 @@ def joint_path(
         machine: Machine of the joints.
         plan: A `Plan` of tasks that run along the whole path without a pause, in one part or several, with a fixed or
             free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
-            (M,) from 0 to the path's length and joint positions (M, n); ten samples resolve a segment of the path.
+            (M,) from 0 to the path's length and joint positions (M, n); 24 samples resolve a segment of the path.
         path: Path of the tool.
         samples: Least number of samples of a plan or a solution. Short segments of the path have more.
         names: Names of the joints; the robot's if None.
@@ -299,7 +299,6 @@ class _BatchedFunction:
     """Evaluator of a casadi SX Function that applies each instruction to arrays of many inputs at once."""
 
     def __init__(self, function: Any) -> None:
-        self.several = function.map(SPLINE.points)
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
         # rows of the table: the function's own memory, its inputs, its outputs, its constants
         size = [function.size1_in(k) for k in range(function.n_in())]
@@ -308,7 +307,7 @@ class _BatchedFunction:
         self.inputs, self.outputs = slice(inputs[0], outputs[0]), slice(outputs[0], self.rows)
         self.constants: list[float] = []
         self.steps: list[tuple[Any, ...]] = []
-        self.tables: list[tuple[Array, list[tuple[Any, list[Array]]]]] = []
+        self.tables: dict[int, list[tuple[Array, list[tuple[Any, list[Array]]]]]] = {}  # by width
         row: dict[int, int] = {}  # row of each memory location
         for k in range(function.n_instructions()):
             kind, source, target = (
@@ -333,44 +332,28 @@ class _BatchedFunction:
         results = [np.empty((count, size)) for size in self.sizes]
         for first in range(0, count, SPLINE.batch):
             part = slice(first, min(first + SPLINE.batch, count))
-            evaluate = self._evaluate_points if part.stop - first < SPLINE.few else self._evaluate_batch
-            evaluate([value[part] for value in inputs], [value[part] for value in results])
+            self._evaluate_batch([value[part] for value in inputs], [value[part] for value in results])
         return results
-
-    def _evaluate_points(self, inputs: list[Array], results: list[Array]) -> None:
-        """Evaluate the function for a few inputs one after the other, `SPLINE.points` in a call."""
-        buffer, evaluate = self.several.buffer()
-        memory = [np.zeros((SPLINE.points, value.shape[1])) for value in (*inputs, *results)]
-        for k in range(len(inputs)):
-            buffer.set_arg(k, memory[k].data)
-        for k in range(len(results)):
-            buffer.set_res(k, memory[len(inputs) + k].data)
-        for first in range(0, len(inputs[0]), SPLINE.points):
-            part = slice(first, min(first + SPLINE.points, len(inputs[0])))
-            for array, value in zip(memory, inputs, strict=False):
-                array[: part.stop - first] = value[part]
-            evaluate()
-            for array, result in zip(memory[len(inputs) :], results, strict=True):
-                result[part] = array[: part.stop - first]
 
     def _evaluate_batch(self, inputs: list[Array], results: list[Array]) -> None:
         """Evaluate the function for at most `SPLINE.batch` inputs at once."""
-        try:
-            table, steps = self.tables.pop()
-        except IndexError:  # first call, or in use by another thread
-            table, steps = self._table()
         count = len(inputs[0])
+        width = min(SPLINE.batch, 1 << (count - 1).bit_length())  # operations on the work array take its whole width
+        try:
+            table, steps = self.tables.setdefault(width, []).pop()
+        except IndexError:  # first call, or in use by another thread
+            table, steps = self._table(width)
         np.concatenate([value.T for value in inputs], out=table[self.inputs, :count])
         for operation, places in steps:
             operation(*places)
         outputs = np.split(table[self.outputs, :count], np.cumsum(self.sizes)[:-1])
         for result, part in zip(results, outputs, strict=True):
             result[:] = part.T
-        self.tables.append((table, steps))
+        self.tables[width].append((table, steps))
 
-    def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
+    def _table(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
         """Return a work array with one line per intermediate value, and the function's instructions on its lines."""
-        table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
+        table = np.zeros((self.rows + len(self.constants), width))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
         return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]

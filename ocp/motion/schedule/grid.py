@@ -125,6 +125,14 @@ class Grid:
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
         return rows.take(slice(count)), rows.take(right)
 
+    def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
+        """Return the grid of the N intervals from a node on, each split into a number of equal parts (N,)."""
+        last, ends = first + len(parts), np.append(0, np.cumsum(parts))
+        s = np.interp(np.arange(ends[-1] + 1), ends, self.distance[first : last + 1])
+        own = (self.jumps > first) & (self.jumps <= last)
+        jumps, requested = ends[self.jumps[own] - first], np.repeat(self.requested[first:last], parts)
+        return Grid(self.path, self.limits, self.joints, s, requested, jumps, self.before[own], self.sharp)
+
     def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]

@@ -11,9 +11,9 @@ are linear in (x, x', x'') except for x^(-1/2), which is convex: the time is a c
 <= convex, whose tangent is conservative (Debrouwere et al., Time-Optimal Path Following for Robots With Convex-Concave
 Constraints, 2013). Each step of the primal-dual interior point updates the tangents.
 
-x is a spline of degree 2 with a knot at every node: x'' is constant in an interval. Its B-spline coefficients are the
-unknowns; a row involves three of them and the normal equations have five diagonals, so a step costs time and memory in
-proportion to the nodes.
+x is a spline with a knot at every node; in an interval x'' is proportional to the reciprocal of a speed that is known
+in advance. Its coefficients are the unknowns; a row involves three of them and the normal equations have five
+diagonals, so a step costs time and memory in proportion to the nodes.
 
 Motions at distant places are almost independent. Therefore each interval has its own step length, which varies slowly
 along the path; the number of steps then hardly grows with the nodes. If such steps diverge from the bounds, all
@@ -81,7 +81,6 @@ class SplineRows(NamedTuple):
     Attributes:
         interval: Interval in which each row holds. Shape (M,).
         fraction: Position in the interval at which it holds, in [0, 1]. Shape (M,).
-        root: Position in the interval of the x of x^(-1/2). Shape (M,).
         of: Coefficients c in c . (x, x', x'') <= bound for squared speed x. Shape (M, 3).
         bound: Upper bound of each row. Shape (M,).
         jerk: Whether the row is a limit of jerk, c . (x, x', x'') <= bound x^(-1/2). Shape (M,).
@@ -89,25 +88,30 @@ class SplineRows(NamedTuple):
 
     interval: NDArray[np.intp]
     fraction: Array
-    root: Array
     of: Array
     bound: Array
     jerk: NDArray[np.bool_]
 
 
 class Spline:
-    """Quadratic spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients."""
+    """Spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients.
 
-    def __init__(self, nodes: Array) -> None:
-        self.nodes, self.h = nodes, np.diff(nodes)
-        before, after = np.append(0.0, self.h), np.append(self.h, 0.0)
-        self.width = before + after
-        self.share = before / self.width
+    In an interval the acceleration is linear in the time of a motion whose speed is linear in time, from `ratios` times
+    its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With ratios of 1 this
+    is a spline of degree 2. The coefficients are the values where the tangents at neighbouring nodes meet.
+    """
+
+    def __init__(self, nodes: Array, ratios: Array) -> None:
+        self.nodes, self.h, self.ratios = nodes, np.diff(nodes), ratios
+        mean = (4 - ratios) / 6
+        before, after = np.append(0.0, mean * self.h), np.append((1 - mean) * self.h, 0.0)
+        self.width = 2 * (before + after)
+        self.share = 2 * before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
         """Return a spline whose consecutive coefficients are those of this spline at the given indices `at`."""
         part, last = copy(self), len(self.h)
-        part.h = self.h[np.minimum(at[:-2], last - 1)]
+        part.h, part.ratios = (kind[np.minimum(at[:-2], last - 1)] for kind in (self.h, self.ratios))
         nodes = np.minimum(at[:-1], last)
         part.nodes, part.width, part.share = self.nodes[nodes], self.width[nodes], self.share[nodes]
         return part
@@ -123,13 +127,12 @@ class Spline:
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
         """Return matrices from 3 coefficients to squared speed and its 2 derivatives at M points. Shape (3, 3, M)."""
-        h, share = self.h[interval], self.share[interval]
-        inside = fraction * h
+        h, share, ratio = self.h[interval], self.share[interval], self.ratios[interval]
+        time = 2 * fraction / (ratio + np.sqrt(ratio**2 + 4 * (1 - ratio) * fraction))  # fraction of the time
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
-        second = np.array([first / h, -(first + last) / h, last / h])
-        slope_at_start = np.array([-first, first, 0 * h])
-        slope = slope_at_start + inside * second
-        value = inside / 2 * (slope_at_start + slope)
+        start, change = np.array([-first, first, 0 * h]), np.array([first, -(first + last), last])
+        slope, second = start + change * time, change / (h * (ratio + 2 * (1 - ratio) * time))
+        value = h * (start * fraction + change * (fraction * time - time**2 * (ratio / 2 + (1 - ratio) * time / 3)))
         value[0] += 1 - share
         value[1] += share
         return np.array([value, slope, second])
@@ -184,9 +187,9 @@ class _EndConditions:
     """End conditions of a spline of the squared speed: fixed coefficients or, at rest, a ratio of the outermost two."""
 
     def __init__(self, program: Program) -> None:
-        n, h, (first, last) = len(program.upper), program.spline.h, program.rest
-        self.sides = [(0, 1, 1 / (1 + 2 * h[0] / (3 * first)))] if first else []
-        self.sides += [(n - 1, n - 2, 1 / (1 + 2 * h[-1] / (3 * last)))] if last else []
+        n, width, (first, last) = len(program.upper), program.spline.width, program.rest
+        self.sides = [(0, 1, 1 / (1 + 2 * width[0] / (3 * first)))] if first else []
+        self.sides += [(n - 1, n - 2, 1 / (1 + 2 * width[-1] / (3 * last)))] if last else []
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
     def impose(self, b: Array) -> Array:
@@ -274,14 +277,12 @@ class _Constraints:
         self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
         self.gradients = self.linear.copy()
         self.jerk = int(len(order) - rows.jerk.sum())  # first jerk limit
-        self.square = spline.basis(interval[self.jerk :], rows.root[order[self.jerk :]])[0]
+        self.square = basis[0][:, self.jerk :]
         self.sharp = self.bound[self.alone + self.jerk :].copy()
         self.bound[self.alone + self.jerk :] = 0.0
         ends = np.searchsorted(np.sort(interval), np.arange(self.count + 1))
-        shape = self.count, len(interval)
-        self.by_interval = scipy.sparse.csr_array(
-            (np.ones(len(interval)), np.argsort(interval, kind="stable"), ends), shape
-        )
+        data = np.ones(len(interval)), np.argsort(interval, kind="stable"), ends
+        self.by_interval = scipy.sparse.csr_array(data, (self.count, len(interval)))
         block = self.interval // INTERIOR.block
         starts = np.diff(block, prepend=-1) != 0
         starts[self.count : self.count + 1] = True
@@ -294,10 +295,8 @@ class _Constraints:
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
-        gap, size = (
-            self._all_values(b, _weighted_sum(self.linear, coefficients)) - self.bound,
-            np.abs(self.bound) + 1e-300,
-        )
+        gap = self._all_values(b, _weighted_sum(self.linear, coefficients)) - self.bound
+        size = np.abs(self.bound) + 1e-300
         gap[sharp:] -= root
         size[sharp:] += root
         tangent = self.gradients[:, self.jerk :]
@@ -431,10 +430,9 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         per_slack, residual = 1 / slack, gap + slack
         weight = multiplier * per_slack
         squares = constraints.outer_products(weight)
+        hessian = [own + more for own, more in zip(curvature, squares, strict=True)]
         try:
-            equations = _BandSolver(
-                ends.reduce_hessian(*(own + more for own, more in zip(curvature, squares, strict=True)))
-            )
+            equations = _BandSolver(ends.reduce_hessian(*hessian))
         except np.linalg.LinAlgError:
             break
         gradient = slope + constraints.weighted_gradients(weight * residual)
@@ -456,15 +454,11 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             constraints.step_lengths(slack_change * per_slack, INTERIOR.to_boundary, INTERIOR.reduction),
             constraints.step_lengths(multiplier_change / multiplier, INTERIOR.to_boundary, INTERIOR.to_boundary),
         ]
-        shortest = [each.min() for each in lengths]
+        primal, dual = (each.min() for each in lengths)
         if uniform:
-            lengths = [np.full(count, each) for each in shortest]
+            lengths = [np.full(count, each) for each in (primal, dual)]
         else:
-            before = (
-                (b, shortest[0], change),
-                (slack, shortest[0], slack_change),
-                (multiplier, shortest[1], multiplier_change),
-            )
+            before = (b, primal, change), (slack, primal, slack_change), (multiplier, dual, multiplier_change)
         b = b + np.concatenate([lengths[0][:1], lengths[0], lengths[0][-1:]]) * change
         slack = slack + lengths[0].take(constraints.interval) * slack_change
         multiplier = multiplier + lengths[1].take(constraints.interval) * multiplier_change

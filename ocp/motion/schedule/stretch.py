@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from models.checks import Array
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.schedule.grid import GAUSS, Grid, acceleration_bounds, limit_slope, node_minimum, reachable_squares
+from ocp.motion.schedule.grid import SETTINGS as GRID_SETTINGS
 from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
@@ -50,6 +51,8 @@ class StretchSettings:
         rounds: Largest number of rounds of tightening the limits.
         unused: Share of the time by which intervals are longer whose middle uses no limit up though an end does, above
             which they are halved.
+        lost: Predicted share of the time that a motion loses because its jerk is constant in each interval: the
+            promised accuracy.
         exceeded: Share by which a motion without jerk limits may exceed limits between nodes: half of the promised
             accuracy of 1e-3.
         parts: Largest number of parts into which an interval is split at once.
@@ -64,11 +67,11 @@ class StretchSettings:
             that of the solution of a similar program.
         again_inside: Further factor if that start fails.
         center, center_again: Initial complementarity over the time for these starts.
-        dive: Least squared speed inside an interval over that at its beginning, for rough splines.
     """
 
     rounds: int = 20
     unused: float = 1e-4
+    lost: float = 1e-3
     exceeded: float = 5e-4
     parts: int = 8
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
@@ -82,7 +85,6 @@ class StretchSettings:
     again_inside: float = 0.3
     center: float = 1.0
     center_again: float = 0.1
-    dive: float = 0.01
 
 
 SETTINGS = StretchSettings()
@@ -102,45 +104,31 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         end = stretch.last if stretch.last - begin < SETTINGS.window + SETTINGS.overlap else begin + SETTINGS.window
         last = end == stretch.last
         seam = end if last else end - SETTINGS.overlap
-        goal = stretch.ends[1] if last else (0.0, 0.0)
-        window = Window.build(stretch, begin, end, (state, goal))
-        part, state, behind = _solve_window(window, seam, behind)
-        parts.append(part)
+        window = Window.build(stretch, begin, end, (state, stretch.ends[1] if last else (0.0, 0.0)))
+        enforced = EnforcedRows.build(window)
+        if behind is not None:
+            enforced.inherited = part = len(behind.ratios)
+            for margin, previous in zip(enforced.margins, behind.margins, strict=True):
+                margin[:part] = previous
+            enforced.mask[:, :, :part], enforced.ratios[:part] = behind.mask, behind.ratios
+        x, slope, window, enforced, at = _tighten(window, enforced, seam)
+        parts.append(motion_profile(window, x[: at + 1], slope))
         if last:
             return join_profiles(parts)
-        begin = seam
+        begin, state, behind = seam, (float(x[at]), float(slope[at])), enforced.take(slice(at, None))
 
 
-def _solve_window(
-    window: Window, seam: int, before: EnforcedRows | None
-) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the fastest motion in a window (intervals of a path solved at once), up to the start of the next window.
-
-    Also return the squared speed and its slope at that node, `seam`, and the limits enforced beyond it; `before` are
-    those that the previous window enforced beyond its own seam.
-    """
-    enforced = EnforcedRows.build(window)
-    if before is not None:
-        for margin, previous in zip(enforced.margins, before.margins, strict=True):
-            margin[: len(previous)] = previous
-        enforced.mask[:, :, : before.mask.shape[2]] = before.mask
-        enforced.speeds[:, : before.mask.shape[2]] = before.speeds
-        enforced.inherited = before.mask.shape[2]
-    to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
-    x, slope = _tighten(window, enforced, seam, checked)
-    state = float(x[to_seam]), float(slope[to_seam])
-    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.after(to_seam)
-
-
-def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> Motion:
+def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, Array, Window, EnforcedRows, int]:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
-    first `checked` intervals must keep the limits.
+    The second motion shows the intervals to split; the window, its limits and the number of intervals before the seam
+    are returned as they then are. If few intervals still violate limits, these are planned again with their neighbours,
+    between fixed motions. The first intervals beyond the seam must keep the limits as well.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
     for number in range(SETTINGS.rounds):
+        checked = min(seam + SETTINGS.overlap // 2, window.last) - window.first
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
             x, slope = _solve_with_jerk(window, enforced, seam, start, accuracy, free)
@@ -149,26 +137,55 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
                 raise
             free = every  # too short for the change of motion
             continue
-        used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None)
+        profile = motion_profile(window, x, slope)
+        used, values = limit_usage(window, profile, free, start is not None)
         used /= _seam_shares(window, seam)[:, None]
-        if start is None:
+        start = x, slope
+        if number == 0:
             enforced.enforce_near(used, values, window.rows[1].jerk[:, :, 0])
-            start = x, slope
             continue
         violated = used > 1 + ROUNDING_SHARE
         affected = np.asarray(violated.any(axis=(0, 2)))
         if not affected[:checked].any() and accuracy == accuracies[-1]:
-            return x, slope
+            return x, slope, window, enforced, seam - window.first
         if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
         enforced.lower(used, enforced.enforce(violated, values), window.rows[0], seam - window.first)
-        start = x, slope
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
+        if number == 1:
+            parts = _parts_by_unused_jerk(window, seam, profile, values)
+            grid, seam = window.grid.split(window.first, parts), int(parts[: seam - window.first].sum())
+            window, enforced = (
+                Window.build(Stretch(grid, 0, 0), 0, int(parts.sum()), window.ends),
+                enforced.split(parts),
+            )
+            motion, free = profile.at_distance(window.nodes), np.arange(window.last)
+            start, every = (motion.speed**2, 2 * motion.acceleration), free
     worst = used[:, :checked].max(axis=(0, 2))
     place, largest = float(window.nodes[worst.argmax()]), float(worst.max())
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
+
+
+def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
+    """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
+
+    Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
+    u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
+    of this is saved on the way to the top speed. Of this loss, 1 / n^2 remains in n parts.
+    """
+    requested = window.grid.requested[window.first : window.last]
+    speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
+    unused = np.maximum(1 - np.maximum(np.abs(values).max(axis=2).mean(axis=0), speed), 0.0)
+    time, a = np.diff(profile.t[::2]), np.abs(profile.acceleration[::2])
+    sharp = np.abs(window.rows[2].jerk[:, :, 0]).max(axis=1)
+    loss = unused * time**2 / (8 * np.maximum(np.maximum(a[:-1], a[1:]) * sharp, time))
+    loss[seam - window.first :] = 0.0
+    # the sum of loss / n^2 for a given sum of n is least if n is proportional to the cube root
+    root = np.cbrt(loss)
+    parts = np.rint(root * np.sqrt(root.sum() / (SETTINGS.lost * profile.t[2 * (seam - window.first)])))
+    return np.asarray(np.clip(parts, 1, SETTINGS.parts), dtype=np.intp)
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
@@ -274,13 +291,6 @@ def _usage_without_jerk(
     return used, np.maximum((vertex + error).max(axis=0), used.max(axis=0))
 
 
-def _row_speed_caps(left: Rows, right: Rows) -> Array:
-    """Return the greatest squared speeds that the speed limits on both sides of each node permit."""
-    left, right = (side.speed.max(axis=1, initial=0.0) for side in (left, right))
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
-
-
 def _solve_with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
@@ -291,51 +301,47 @@ def _solve_with_jerk(
     seam_shares = _seam_shares(window, seam)
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
-    caps = np.minimum(node_minimum(requested), _row_speed_caps(left, right) * node_minimum(shares.speed) ** 2)
+    first, inside, last = (rows.speed.max(axis=1, initial=0.0) for rows in (left, middle, right))
+    with np.errstate(divide="ignore"):
+        permitted = np.maximum(np.append(first, 0.0), np.insert(last, 0, 0.0)) ** -2.0
+        between = (inside / shares.speed) ** -2.0
+    caps = np.minimum(node_minimum(requested), permitted * node_minimum(shares.speed) ** 2)
     rates = acceleration_bounds(left, right, caps[:-1], caps[1:])
     reachable = reachable_squares(nodes, caps, rates, at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]
-    for side, resting in enumerate(at_rest):
-        if resting:
-            node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
-            rest[side] = float(width)
-            sharp = _rest_jerk(left, right, float(width), side, shares.jerk)
-            caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
-    inner = slice(low, high)
-    cells = slice(low, high - 1)
-    spline = Spline(nodes[inner])
-    with np.errstate(divide="ignore"):
-        between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
+    for side in np.flatnonzero(at_rest).tolist():
+        node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
+        rest[side] = float(width)
+        sharp = _rest_jerk(left, right, float(width), side, shares.jerk)
+        caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
+    inner, cells = slice(low, high), slice(low, high - 1)
+    if known is not None and len(free) == end - begin:
+        v, new = np.sqrt(known[0]), slice(max(low, enforced.inherited), high - 1)
+        least = 2 / (1 + np.sqrt(1 + GRID_SETTINGS.rise))  # a greater rise is that of a rough motion
+        enforced.ratios[new] = np.clip(2 * v[:-1] / (v[:-1] + v[1:]), least, 2 - least)[new]
+    spline = Spline(nodes[inner], enforced.ratios[cells])
     upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
-    mask = enforced.mask
+    mask = enforced.mask.copy()
     if known is None:
-        mask = mask.copy()
         start = _initial_squares(nodes, np.minimum(reachable, caps), left, right, ends)[inner]
         b = np.concatenate([start[:1], np.minimum(start[:-1], start[1:]), start[-1:]])
         mask[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
     else:
         b = spline.through(known[0][inner], known[1][inner])
         b = np.maximum(b, 1e-9 * b.max())
-        # fixed and inherited intervals keep their speed ratios
-        new = free[(free >= max(low, enforced.inherited)) & (free < high - 1)]
-        enforced.speeds[:, new] = _speed_ratios(spline, b)[:, new - low]
     fixed: list[int] = []
-    sides = ((0, 1, spline.h[0]), (len(b) - 1, len(b) - 2, -spline.h[-1]))
+    sides = ((0, 1, spline.width[0]), (len(b) - 1, len(b) - 2, -spline.width[-1]))
     for (x_end, slope_end), resting, (outermost, next_to, signed_width) in zip(ends, at_rest, sides, strict=True):
         if not resting:
             b[outermost], b[next_to] = x_end, x_end + signed_width * slope_end / 2
             upper[[outermost, next_to]] = np.inf
             fixed += [outermost, next_to]
-    own_shares = shares.take(cells)
-    in_motion = (not at_rest[0], not at_rest[1])
-    places = tuple(rows.take(cells) for rows in window.rows)
+    places, in_motion = tuple(rows.take(cells) for rows in window.rows), (not at_rest[0], not at_rest[1])
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
-    rows = _spline_rows(
-        places, mask[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
-    )
+    rows = _spline_rows(places, mask[:, :, cells], caps[inner], implied, shares.take(cells), in_motion)
     program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
         if known is None:
@@ -347,8 +353,7 @@ def _solve_with_jerk(
             b[at] = _resolve(part, b[at], accuracy)
     except SolveError as error:
         message = f"{error}; raise the limits, or keep the path away from singular arms"
-        details = {"name": "limits", "value": error.value, "limit": error.limit, "time": error.time}
-        raise ProblemError(message, **details) from error
+        raise ProblemError(message, name="limits", value=error.value, limit=error.limit, time=error.time) from error
     x, slope = np.zeros(len(nodes)), np.zeros(len(nodes))
     x[inner], slope[inner] = spline.at_nodes(b)
     return x, slope
@@ -400,7 +405,6 @@ def _spline_rows(
     caps: Array,
     implied: Array,
     shares: Margins,
-    speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
     """Return the enforced limits as constraints on the spline of the squared speed along a path.
@@ -410,7 +414,6 @@ def _spline_rows(
         mask: Which of them are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the limits that each interval may use.
-        speeds: Speed ratios at the `ENFORCED_AT` positions, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -422,7 +425,7 @@ def _spline_rows(
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speed_rows(slow, np.full(len(slow), inside), most))
-    for which, at_place, speed in zip(mask, ENFORCED_AT, speeds, strict=True):
+    for which, at_place in zip(mask, ENFORCED_AT, strict=True):
         inside, rows, active = (0.0, *INSIDE, 1.0)[at_place], places[at_place], which[:, :, first:second].copy()
         if inside in (0.0, 1.0) and in_motion[int(inside)]:
             active[:, -int(inside)] = False
@@ -431,43 +434,19 @@ def _spline_rows(
         direction, place = 1.0 - 2.0 * sign, np.full(len(at), inside)
         of = direction[:, None] * np.stack([q, p / 2, np.zeros(len(at))], axis=1)
         bound, is_jerk = shares.acceleration[at, row] - direction * r, np.zeros(len(at), dtype=bool)
-        parts.append(SplineRows(at, place, place, of, bound, is_jerk))
+        parts.append(SplineRows(at, place, of, bound, is_jerk))
         sign, at, row = np.nonzero(which[:, :, second:])
         p, q, r = rows.jerk[at, row].T
-        of = (1.0 - 2.0 * sign)[:, None] * np.stack([speed[at] * r, speed[at] * q / 2, p / 2], axis=1)
-        root = np.full(len(at), _jerk_place(inside))
+        of = (1.0 - 2.0 * sign)[:, None] * np.stack([r, q / 2, p / 2], axis=1)
         place, is_jerk = np.full(len(at), inside), np.ones(len(at), dtype=bool)
-        parts.append(SplineRows(at, place, root, of, shares.jerk[at, row], is_jerk))
+        parts.append(SplineRows(at, place, of, shares.jerk[at, row], is_jerk))
     return SplineRows(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
-
-
-def _jerk_place(inside: float) -> float:
-    """Return the fraction of an interval at which a spline's jerk equals the constant jerk of the motion in that half.
-
-    With squared speed x, the spline's jerk is x''/2 v. With a = a0 + x''/2 (s - s0), two jerks over half the time T
-    each lead to the speed and acceleration at its end if they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6),
-    up to terms of second order.
-    """
-    return 1 / 6 if inside < 0.5 else 5 / 6
-
-
-def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the speeds at the points where limits are enforced over those at the points of `_jerk_place`."""
-    x, slope = spline.at_nodes(b)
-    second = np.diff(slope) / spline.h
-
-    def at(inside: float) -> Array:
-        distance = inside * spline.h
-        return np.asarray(np.maximum(x[:-1] + distance * (slope[:-1] + distance * second / 2), SETTINGS.dive * x[:-1]))
-
-    places = [(0.0, *INSIDE, 1.0)[k] for k in ENFORCED_AT]
-    return np.sqrt([at(inside) / at(_jerk_place(inside)) for inside in places])
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
     """Return constraints `of` times squared speed <= 1 at given points, each a fraction of an interval."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
-    return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
+    return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:

@@ -138,8 +138,8 @@ class Margins(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def take(self, part: slice) -> Margins:
-        """Return the usable fractions of the limits in some intervals, as views of the same memory."""
+    def take(self, part: slice | NDArray[np.intp]) -> Margins:
+        """Return the usable fractions of the limits in some intervals, as views of the same memory for a slice."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
@@ -156,14 +156,14 @@ class EnforcedRows:
         times: Number of reductions of each margin.
         mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
-        speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
+        ratios: Speed where each interval begins over its mean there, see `Spline`. Shape (N,).
         inherited: Number of intervals taken over from the previous window.
     """
 
     margins: Margins
     times: Margins
     mask: NDArray[np.bool_]
-    speeds: Array
+    ratios: Array
     inherited: int = 0
 
     @classmethod
@@ -173,12 +173,27 @@ class EnforcedRows:
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
         mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)))
+        return cls(margins, times, mask, np.ones(count))
 
-    def after(self, first: int) -> EnforcedRows:
-        """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
-        part = slice(first, None)
-        return EnforcedRows(self.margins.take(part), self.times.take(part), self.mask[:, :, part], self.speeds[:, part])
+    def take(self, part: slice | NDArray[np.intp]) -> EnforcedRows:
+        """Return the enforced limits in some intervals, as views of the same memory for a slice."""
+        margins, times = self.margins.take(part), self.times.take(part)
+        return EnforcedRows(margins, times, self.mask[:, :, part], self.ratios[part], self.inherited)
+
+    def split(self, parts: NDArray[np.intp]) -> EnforcedRows:
+        """Return the enforced limits after each interval is split into a number of equal parts (N,).
+
+        Splines before the split remain possible. Split intervals may use the limits fully: what happens between nodes
+        decreases with their distance, and a motion from the previous window keeps the limits there.
+        """
+        rows, count = self.take(np.repeat(np.arange(len(parts)), parts)), np.repeat(parts, parts)
+        rows.inherited = int(parts[: self.inherited].sum())
+        for margin, times in zip(rows.margins, rows.times, strict=True):
+            margin[count > 1], times[count > 1] = 1 - SETTINGS.room, 0.0
+        number = np.arange(len(count)) - np.repeat(np.cumsum(parts) - parts, parts)
+        first, last = (np.sqrt(rows.ratios**2 + 4 * (1 - rows.ratios) * (number + k) / count) for k in (0, 1))
+        rows.ratios = 2 * first / (first + last)
+        return rows
 
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
@@ -276,8 +291,7 @@ def limit_usage(
     first = states(2 * which, profile.jerk[2 * which])
     last = states(2 * which + 2, profile.jerk[2 * which + 1])
     zero = np.zeros(count)
-    places = np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h])
-    inside = profile.at_distance(places)
+    inside = profile.at_distance(np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h]))
     quarter, met, three_quarter = (
         LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3)
     )

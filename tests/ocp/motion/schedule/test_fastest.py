@@ -30,6 +30,7 @@ from ocp.motion.schedule import (
 )
 from ocp.motion.schedule import grid as grids
 from ocp.motion.schedule import stretch as stretches
+from ocp.motion.schedule.grid import make_grid
 from ocp.motion.schedule.ramps import reachability_passes
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.families import some
@@ -248,9 +249,9 @@ def test_windows_change_the_time_by_next_to_nothing(monkeypatch: pytest.MonkeyPa
 def panda() -> tuple[SmoothPath, PlannedJoints, Schedule]:
     """Short lines with rounded corners, the joints along them, and their schedule in one window."""
     path, joints = panda_path(20)
-    plan = schedule(path, LineLimits(0.5, 5.0, 200.0, 5.0, PANDA), joints=joints)
-    assert len(plan.profile.jerk) < 2 * stretches.SETTINGS.window
-    return path, joints, plan
+    limits = LineLimits(0.5, 5.0, 200.0, 5.0, PANDA)
+    assert len(make_grid(path, limits, joints).requested) < stretches.SETTINGS.window
+    return path, joints, schedule(path, limits, joints=joints)
 
 
 @pytest.mark.parametrize(("window", "overlap"), [(120, 40), (60, 30)])
