@@ -57,14 +57,14 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 class Switches(NamedTuple):
-    """Switches of a plan as fractions (k,) of the horizon, and a mask (N,) of mesh intervals that smear a switch."""
+    """Horizon fractions (k,) where limits become active or inactive; mask (N,) of mesh intervals in transition."""
 
     fractions: np.ndarray
     smeared: np.ndarray
 
 
 def locate_switches(problem: Problem, solution: Solution) -> Switches:
-    """Return the switches of a plan, where limits become active or inactive, and the mesh intervals that smear them.
+    """Return where along a plan limits become active or inactive, and the mesh intervals in these transitions.
 
     ``solution`` is a plan of ``problem`` by collocation with controls at the points.
     """

@@ -203,7 +203,7 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the Function that finds the best roll angle among the stationary points of the cost index.
+        """Return the casadi Function that finds the best roll angle among the stationary points of the cost index.
 
         (target, previous) -> (answer, done, best, evaluations). `done` says that the answer is final: it is within
         reach and limits, or the input is not finite.
@@ -242,7 +242,7 @@ class Search:
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the Function that searches the ends of feasible roll intervals for a roll better than the incumbent.
+        """Return the casadi Function that searches the ends of feasible roll intervals for a roll of lower cost.
 
         (target, previous, best, `count` evaluations) -> answer.
         """
@@ -268,7 +268,7 @@ class Search:
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
     def _closed_form_ends(self) -> Any:
-        """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
+        """Return the casadi Function that compares the best roll so far with closed-form ends of roll intervals.
 
         (target, previous, best) -> (best, evaluations).
         """
@@ -281,7 +281,7 @@ class Search:
         )
 
     def _rough_stationary(self) -> Any:
-        """Return the Function that approximates the roll angles at which the cost index I1 is stationary.
+        """Return the casadi Function that approximates the roll angles at which the cost index I1 is stationary.
 
         (target) -> rough; NO_ROLL if there is only one minimum. In the axes of trigonometric.least_point there are only
         two stationary points outside the astroid |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4
@@ -298,7 +298,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function that compares the incumbent with ends of roll intervals at limits of yaw joints 2 and 3.
+        """Return the casadi Function that compares the best roll so far with rolls that put joint 2 or 3 at a limit.
 
         (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
         evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
@@ -343,7 +343,7 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function that compares the incumbent with roll angles that put prismatic joint 1 at a limit.
+        """Return the casadi Function that compares the best roll so far with rolls that put joint 1 at a limit.
 
         (target, previous, best) -> best.
         """
@@ -389,7 +389,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function that refines `count` approximate roll angles and compares them with the incumbent.
+        """Return the casadi Function that refines `count` approximate rolls and compares them with the best so far.
 
         (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
         """
@@ -417,10 +417,9 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare given rolls with the incumbent; return the best roll, and evaluations and least cost of the given
-        rolls.
+        """Compare given rolls with the best roll so far, `best`, and return the best of all.
 
-        The result is (Incumbent, list of Evaluation, cost).
+        The result is (Incumbent, list of Evaluation, cost): evaluations and least cost are those of the given rolls.
         """
         f = self._index(target)
         cost, c, s, code, below, above = best
@@ -450,14 +449,14 @@ class Search:
         return configuration_at(self.rig, target, c, s, branch=self.branch)
 
     def _finish(self) -> Any:
-        """Return the Function of target, previous roll and incumbent that computes joint positions at the incumbent."""
+        """Return the casadi Function that computes the joint positions at the best roll angle that the search found."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function that reports an infeasible target: joint positions nan, and the reason as status."""
+        """Return the casadi Function for an infeasible target: joint positions nan, and the reason as status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))

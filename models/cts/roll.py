@@ -415,10 +415,10 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function from target and previous roll to five rolls, among them all minima of the cost index I2.
+    """Return a casadi Function from target and previous roll to five roll angles that include all minima of their cost.
 
-    I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
-    window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
+    The cost is the index I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex, its one minimum
+    is repeated. Otherwise the window of rolls is split where I1'' = -2 gain, and each interval yields one roll.
     """
     target, previous = ca.SX.sym("target", 5), ca.SX.sym("previous")
     f = index_harmonics(rig, tunnel, target)

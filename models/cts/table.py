@@ -123,7 +123,7 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return the result of the best branch for each target. Shape (samples, 10).
+    """Return for each target the least-cost solution among the inverse kinematics branches. Shape (samples, 10).
 
     Columns: joint positions (6), cost, branch number, codes of active constraint and status.
     """

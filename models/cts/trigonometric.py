@@ -346,7 +346,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function that performs `count` iterations of the method by which `series_roots` finds all roots.
+    """Return the casadi Function that performs `count` iterations of Aberth's method for all roots of a polynomial.
 
     (roots, coefficients) -> (roots, excess of the last step over the tolerance).
     """

@@ -158,7 +158,7 @@ class FixedBase:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the rate of the base configuration, an empty column of the type of the joint rates. Shape (0, 1)."""
+        """Return the rate of the base configuration, which is empty because the base is fixed. Shape (0, 1)."""
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:

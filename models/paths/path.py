@@ -362,7 +362,7 @@ def fit_splines(
 
 
 def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
-    """Return a path as a polyline, within `sagitta` of its arcs, and the index of the point at each vertex."""
+    """Return a polyline within `sagitta` (m) of a path's arcs, and the index of its point at each path vertex."""
     with np.errstate(divide="ignore"):
         chord = np.where(path.is_spline, np.inf, np.sqrt(8 * sagitta / path.curvature))
     counts = np.maximum(np.ceil(path.lengths / chord), 1).astype(int)
@@ -377,8 +377,7 @@ def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
 
 
 def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: float) -> NDArray[np.bool_]:
-    """Return whether a run of short segments, which a spline may replace, ends at each vertex of a path. Shape (n +
-    1,).
+    """Return for each vertex of a path whether a run of segments, for a spline to replace, ends there. Shape (n + 1,).
 
     A curve that is within its deviation from the chord c of a simplified polyline bends by 8 deviation / c from chord
     to chord; where the path bends much more, it has a corner.

@@ -351,7 +351,7 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps between two convex bodies along the face normals of the first, of which a segment has none."""
+    """Return the gaps between two convex bodies along the first body's face normals; an empty list without faces."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]

@@ -169,7 +169,7 @@ def nearest_directions(
 
 
 def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of segments, (K, 2, 3), and the vectors between these points, (K, 3) each.
+    """Return both closest points of K pairs of segments (K, 2, 3) and the vectors between them: three arrays (K, 3).
 
     Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
     """

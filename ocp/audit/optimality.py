@@ -113,7 +113,7 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits, as variables of a quadratic program with distances to the limits as prices.
+    """Multipliers of limits: nonnegative variables of a quadratic program whose unit costs are the distances to limits.
 
     Attributes:
         point, limit: Indices of the point and of the limit of each multiplier. Shape (K,).
@@ -399,7 +399,7 @@ def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.nda
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return a plan's excess cost over the optimum for given multipliers, except the cost that a new start saves."""
+    """Return a plan's excess cost over the optimum for given multipliers, except that due to a free initial state."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 

@@ -257,7 +257,9 @@ def _sizes_by_unit(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) ->
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the sizes of watched constraints: the length of a reference path, else the change with the variables.
+    """Return the size of each constraint that `Problem.watch` declares, relative to which its error is judged.
+
+    It is the length of the constraint's reference path or, without one, the change that states and controls cause.
 
     Args:
         by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).

@@ -369,9 +369,9 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return the matrices that combine constraints, variables and slacks to constraints of the elastic program.
+        """Return the matrices R and C that form the constraints R g(v) + C (v, slack) of the elastic program.
 
-        The elastic rows are R g(v) + C (v, slack) with the returned matrices R and C.
+        The n variables are v, the m constraints of the problem are g(v), and the k slacks measure violations.
         """
         chosen = np.concatenate([self.hard, self.lower, self.upper])
         number = np.arange(len(chosen))

@@ -319,7 +319,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Group pairs by the kinds of hulls; yield each group, and its pairs' places in `rows` and in the group."""
+        """Group the pairs `rows` by hull kind; yield each group, and its pairs' places in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:

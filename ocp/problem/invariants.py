@@ -85,7 +85,7 @@ class FirstIntegrals:
 
 
 def coupled_parts(form: Formulation) -> list[np.ndarray]:
-    """Return groups of coupled states on which first integrals that make end conditions redundant may depend.
+    """Return the groups of coupled states in which to seek first integrals that make end conditions redundant.
 
     Only states with end conditions are relevant. If f_i is the only rate among these that contains a control u_j, or
     another state, then grad I . f = 0 for all u_j implies that I does not depend on x_i.

@@ -116,9 +116,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
-    """Piecewise polynomials between breaks t (N + 1,), s, by their Bernstein coefficients (N, d + 1, n), which enclose
-    them.
-    """
+    """Piecewise polynomials between breaks t (N + 1,), s; Bernstein coefficients (N, d + 1, n) enclose their values."""
 
     t: Array
     coefficients: Array
@@ -130,13 +128,13 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
-        """Return the values (M, n) at times (M,), clipped to the range of `t`; at a break those of the later piece."""
+        """Return the values (M, n) at times (M,), clipped to the range of `t`; at a break, of the later polynomial."""
         interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         begin, end = self.t[interval], self.t[interval + 1]
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return the values (M, n) in given intervals (M,) at fractions (M,), 0 to 1, of the interval length."""
+        """Return the polynomials' values (M, n) in given intervals (M,) at fractions (M,), 0 to 1, of their length."""
         degree = self.coefficients.shape[1] - 1
         s = fraction[:, None]
         terms = (
@@ -432,7 +430,7 @@ class _Side(NamedTuple):
 
     @property
     def worst_value(self) -> float:
-        """Largest value towards the limit with its original sign."""
+        """Value that is nearest to the limit, or furthest beyond it, with its original sign."""
         return self.sign * float(self.values.max())
 
 

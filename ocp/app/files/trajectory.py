@@ -386,7 +386,7 @@ def _read_program(file: FileName, language: RobotLanguage, period: float | None)
 def _name_axis(
     language: RobotLanguage, joints: dict[str, tuple[str, float]], remark: re.Match[str], late: bool
 ) -> None:
-    """Store the joint and the unit of a robot axis that a comment of a program states; raise ValueError if invalid."""
+    """Store the joint and unit that a program comment assigns to a robot axis; raise ValueError if they are invalid."""
     axis, column, unit = remark.groups()
     if axis not in (*language.arm, *language.external):
         return  # any other comment

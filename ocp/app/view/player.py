@@ -131,7 +131,7 @@ def _look_alike(a: Robot, b: Robot) -> bool:
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a robot for the page: its surfaces, in the frames of its links, with their colours."""
+    """Return a robot as JSON data of the web page: its surfaces, in the frames of its links, with their colours."""
     movers = [link.name for link in robot.links]
     parts = [
         {
@@ -146,7 +146,7 @@ def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, 
 
 
 def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a surface for the page, with vertices rounded to 1/65535 of its bounding box."""
+    """Return a surface as JSON data of the web page, with vertices rounded to 1/65535 of its bounding box."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = np.maximum(high - low, 1e-9) / 65535
     padded = np.zeros((len(vertices), 4))
@@ -172,7 +172,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
 
 
 def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a motion for the page as data for JSON; its arrays are appended to the buffers."""
+    """Return a motion as JSON data of the web page; its arrays go to `buffers`, the binary data."""
     rows = np.unique(np.linspace(0, len(motion.t) - 1, min(len(motion.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
@@ -241,7 +241,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
 
 
 def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return the description of an obstacle's surface for the page; its arrays are appended to the buffers."""
+    """Return an obstacle's surface as JSON data of the web page; its arrays go to `buffers`, the binary data."""
     part = part_of("", vertices, faces, (0.0, 0.0, 0.0, 1.0))
     return _surface(part.vertices, part.normals, part.faces, buffers)
 

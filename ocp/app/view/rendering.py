@@ -167,7 +167,7 @@ def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """Return the surface of a round tube of a radius, m, and a colour along a line through points (k, 3), m."""
+    """Return the surface of a tube of given radius (m) and colour around the polyline through points (k, 3), m."""
     line = np.asarray(points, dtype=float)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-9 * max(float(np.ptp(line, axis=0).max()), 1e-12)
     line = line[np.append(True, steps)]

@@ -111,7 +111,7 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
 
 
 def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> _Demand:
-    """Return the largest demand on joints, relative to limits, by values (M, n) of a quantity; 0 without limits."""
+    """Return the largest ratio of a joint quantity, with values (M, n), to its limit; the ratio is 0 without limits."""
     most_allowed = getattr(bounds, quantity)
     if not np.isfinite(most_allowed).any():
         return _Demand()
@@ -126,13 +126,13 @@ def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointB
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
-    """Return the largest demand of tasks beyond a limit (of acceleration, jerk, or torque at rest) of a joint that no
-    self-motion moves, on the branch of a plan; None if no limit is exceeded.
+    """Return the largest demand beyond a limit on joints whose motion tasks determine; None if no limit is exceeded.
 
-    A joint that no self-motion moves at a random configuration is not moved at almost all configurations: the tasks
-    determine its motion. Divided differences of its velocity are values of its acceleration and jerk (mean value
-    theorem). In the same way, the tasks determine a gravity torque that no self-motion changes. Returns None on a
-    floating base, with a free horizon, and if there is no such joint.
+    The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
+    moves at a random configuration is not moved at almost all configurations: the tasks determine its motion. Divided
+    differences of its velocity are values of its acceleration and jerk (mean value theorem). In the same way, the tasks
+    determine a gravity torque that no self-motion changes. Returns None on a floating base, with a free horizon, and if
+    there is no such joint.
     """
     machine, demands = request.machine, list[_Demand]()
     if machine.base_size or request.time_cost is not None:

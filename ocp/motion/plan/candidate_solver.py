@@ -235,7 +235,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a list with a copy of a candidate whose start is free, if the candidate passed with a fixed start."""
+        """If a candidate passed its audit with a fixed start, return [a copy with a free start], else an empty list."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints

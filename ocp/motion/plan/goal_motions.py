@@ -303,7 +303,7 @@ class _PathProblem:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping_motion(self) -> Candidate:
-        """Return the audited motion that stops at all corners of the path, extended to the horizon if that is fixed."""
+        """Return the audited motion that stops at all path corners, slowed to end at the horizon if that is fixed."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or task.moves:
             words = "motions with stops are not offered where energy is weighted, or the machine moves at an end"
@@ -321,7 +321,7 @@ class _PathProblem:
         return _audit_candidate(self.task, self.motion.solution(problem, method), self.path)
 
     def without_stops(self) -> Candidate:
-        """Return a locally optimal motion without stops near the path, with its audit."""
+        """Return an audited, locally optimal motion near the collision-free path, without stops at its corners."""
         if has_spline_cost(self.task.request.cost) and not self.task.is_fastest:
             spline = _spline_candidate(self.task, self.path, self.fixed)
             if spline.passed:

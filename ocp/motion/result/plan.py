@@ -391,7 +391,7 @@ class Plan(ABC):
 
 
 def evaluate_parts(begins: Sequence[float], times: Array, width: int, evaluate: Callable[[int, Rows], Array]) -> Array:
-    """Evaluate a quantity at times (M,), each in the consecutive part of a motion that contains it. Shape (M, width).
+    """Evaluate a quantity of a multi-part motion at times (M,), each in the part that contains it. Shape (M, width).
 
     Args:
         begins: Times at which the parts begin, in order, s. A time at which a part begins belongs to this part.

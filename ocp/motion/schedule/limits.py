@@ -361,7 +361,7 @@ class Rows(NamedTuple):
     jerk: Array
 
     def take(self, places: NDArray[Any] | slice) -> Rows:
-        """Return the coefficients of all limits at a subset of the points of the path."""
+        """Return the coefficients of all limit inequalities at a subset of the points of the path."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
@@ -438,7 +438,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the coefficients of all limits, with or without torque limits, at distances (S,) along a path.
+    """Return the coefficients of all limit inequalities, with or without torque limits, at distances (S,) along a path.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
@@ -457,7 +457,7 @@ def limit_rows(
 
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    """Return the coefficients of all limits at no more than `BLOCK_SIZE` distances along a path."""
+    """Return the coefficients of all limit inequalities at no more than `BLOCK_SIZE` distances along a path."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if np.isfinite(limits.centripetal):
         speed[:, 0, 0] = np.sqrt(curvature_along(path, s) / limits.centripetal)

@@ -87,7 +87,7 @@ class Window(Stretch):
 
     @classmethod
     def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
-        """Return the window between two nodes of a path grid, and evaluate the coefficients of all limits in it."""
+        """Return the window between two nodes of a path grid, with the coefficients of all limit inequalities in it."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
@@ -100,7 +100,7 @@ class Window(Stretch):
         return cls(grid, first, last, ends, rows=every, bends=bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return the coefficients of all limits at closely spaced points in intervals, ordered by point, then interval.
+        """Return coefficients of all limit inequalities at closely spaced points in intervals, by point, then interval.
 
         The points divide each interval into SETTINGS.fine parts. Torque limits, which take longest, are optional.
         """
@@ -139,7 +139,7 @@ class Margins(NamedTuple):
     jerk: Array
 
     def take(self, part: slice | NDArray[np.intp]) -> Margins:
-        """Return the usable fractions of the limits in some intervals, as views of the same memory for a slice."""
+        """Return the usable fractions of the limits in selected intervals; a slice selects views of the same memory."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
@@ -168,7 +168,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return an empty set of enforced limits for a window, with the initial usable fractions of all limits."""
+        """Return the limits of a window, none of them enforced yet, with the initial usable fraction of each limit."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -176,7 +176,7 @@ class EnforcedRows:
         return cls(margins, times, mask, np.ones(count))
 
     def take(self, part: slice | NDArray[np.intp]) -> EnforcedRows:
-        """Return the enforced limits in some intervals, as views of the same memory for a slice."""
+        """Return the enforced limits in selected intervals; a slice selects views of the same memory."""
         margins, times = self.margins.take(part), self.times.take(part)
         return EnforcedRows(margins, times, self.mask[:, :, part], self.ratios[part], self.inherited)
 

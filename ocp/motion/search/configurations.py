@@ -347,7 +347,7 @@ def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
 
 
 def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
-    """Raise Unreachable if a fixed-base machine cannot reach a pose; only poses that local motions miss are checked."""
+    """Raise Unreachable if a fixed-base machine cannot reach one of the poses that resolved-rate control missed."""
     if request.machine.base_size:
         return
     limits, starts, seed = request.limits.joints, request.settings.ik_starts, request.seed

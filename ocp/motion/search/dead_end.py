@@ -377,7 +377,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Find the least position (if `turning`, orientation) error of tips near a path (K, n); None if that fails."""
+    """Minimise the error of tip positions, or orientations if `turning`, from a path (K, n); None if that fails."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()

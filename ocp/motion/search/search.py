@@ -1,4 +1,4 @@
-"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of the cost of all motions.
+"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of the cost of any motion.
 
 An atlas of charts covers all configurations that satisfy the tasks at some time samples. Dynamic programming over the
 charts yields lower bounds of the cost-to-go and the cost-to-come, and paths of locally least cost, each of which is a
@@ -193,7 +193,7 @@ class AtlasSearch:
         return part
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths (K, n) sorted by the cost of their steps, and a lower bound of the cost of all paths."""
+        """Return paths (K, n) sorted by the cost of their steps, and a lower bound of the cost of any path."""
         path, bound = self.solve(np.inf)
         return [] if path is None else [path], bound
 
@@ -299,7 +299,7 @@ class AtlasSearch:
     # ---- branch and bound --------------------------------------------------------------------------------------------
 
     def solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return a path (K, n) of nearly least cost, and a lower bound of the cost of all paths.
+        """Return a path (K, n) of nearly least cost, and a lower bound of the cost of any path.
 
         Args:
             max_cost: Initial limit of the cost of one step, such as the cost of a known motion; or inf. It is raised if
@@ -326,7 +326,7 @@ class AtlasSearch:
         return self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return the best path without steps costlier than `max_cost`, and a lower cost bound of all such paths."""
+        """Return the best path without steps costlier than `max_cost`, and a lower cost bound of any such path."""
         layers, best_path = self.find_path(max_cost)
         if not layers:
             return None, np.inf
@@ -336,7 +336,7 @@ class AtlasSearch:
         return self._branch_and_bound(layers, max_cost, self.path_cost(best_path), best_path)
 
     def lower_bound(self, known_cost: float) -> float:
-        """Return a lower bound of the cost of all paths, at most (1 - `gap`) times `known_cost`.
+        """Return a lower bound of the cost of any path, at most (1 - `gap`) times `known_cost`.
 
         No path is searched. The bound is what time limit and memory allow. `known_cost` is that of a known motion.
         """
@@ -345,7 +345,7 @@ class AtlasSearch:
     def _branch_and_bound(
         self, layers: list[Charts], max_cost: float, best_cost: float, best_path: Array | None
     ) -> tuple[Array | None, float]:
-        """Improve the given path, if any, and return it with a lower bound of the cost of all paths."""
+        """Improve the given path, if any, and return it with a lower bound of the cost of any path."""
         target, bound = 1 - self.gap, 0.0
         coarse = best_path is not None
         remaining = np.zeros(len(self.times) - 1)  # least cost before and after each step
@@ -396,7 +396,7 @@ class AtlasSearch:
         return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path whose steps each cost at most `max_cost`; return charts that may contain one, and the path.
+        """Find a path with steps of cost at most `max_cost`; return the charts that it may pass through, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """

@@ -37,7 +37,7 @@ class QuadraticBounds(NamedTuple):
     curve: Array
 
     def select(self, rows: Any) -> QuadraticBounds:
-        """Return the lower bounds on the charts with the given indices."""
+        """Return the lower bounds of the value function on the charts with the given indices."""
         return QuadraticBounds(*(part[rows] for part in self))
 
     @classmethod
@@ -90,9 +90,9 @@ class CurvedCharts(NamedTuple):
 
 
 class StepBounds(Protocol):
-    """Lower bounds of the costs of P steps plus the costs after them, as functions of the steps' starts on charts.
+    """Lower bounds of the cost-to-go through P steps, the steps included, as functions of where on a chart they start.
 
-    Each point p yields a quadratic function that is a lower bound everywhere, by the value and slope at p and `curve`.
+    At each point p, the quadratic function with the bound's value and slope at p, and `curve`, is a lower bound too.
     """
 
     @property
@@ -100,7 +100,7 @@ class StepBounds(Protocol):
         """Symmetric matrices of the quadratic terms. Shape (P, r, r)."""
 
     def select(self, rows: Any) -> Self:
-        """Return the lower cost bounds of those steps that have the given indices."""
+        """Return the lower bounds of the cost-to-go through the steps with the given indices."""
 
     def at(self, places: Array) -> tuple[Array, Array]:
         """Return values (P,) and gradients (P, r) of the cost bounds for steps that start at chart points (P, r)."""

@@ -185,7 +185,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return lower bounds of the cost on the charts of time sample `k` from those, `after`, of the adjacent sample.
+        """Return lower cost bounds on charts of time sample `k`, from the bounds `after` on those of an adjacent one.
 
         With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """
@@ -251,13 +251,13 @@ class ChartGraph:
         return values.minimum(self.layers[k].low, self.layers[k].high)[0]
 
     def cost_through(self, cost_to_come: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
-        """Return lower bounds of the cost of motions through each manifold chart of a time sample. Shape (N,)."""
+        """Return lower bounds of the cost of any motion through each manifold chart of a time sample. Shape (N,)."""
         total = QuadraticBounds(*(first + second for first, second in zip(cost_to_come[k], cost_to_go[k], strict=True)))
         return np.where(np.isfinite(total.least), self.minima(total, k), np.inf)
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return for each step a lower bound of the total cost of all motions that contain this step. Shape (P,)."""
+    """Return, for each step, a lower bound of the cost of any complete motion that contains the step. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]

@@ -59,7 +59,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of joints (n,) that move no task's frame or reference; all False for a moving or unfixed base."""
+        """Mask (n,) of joints that move no task or reference frame; all False if joints may move or tip the base."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)

@@ -219,7 +219,7 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices 0..5 of the prescribed twist components; the two equations of a tool direction are not among them."""
+        """Indices, 0..5, of the prescribed components of the tip's twist; a prescribed tool direction adds no index."""
         return tuple(self.rows or ())
 
     @property

@@ -296,7 +296,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factors of joint positions at the start of the detumbling: 0 for wheels, which restart at 0, else 1."""
+        """Factor that multiplies each joint position as the detumbling starts: 0 for reaction wheels, else 1."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
