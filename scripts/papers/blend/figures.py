@@ -338,7 +338,8 @@ def _limits(folder: Path, results: Results) -> None:
         for (upper, lower), kind in zip(axes.T, ("cubic", "quintic"), strict=True):
             mine = {name: plan for name, plan in results.plans.items() if name.startswith(kind)}
             for (name, plan), color, dash in zip(mine.items(), ("grey", "blue", "green"), DASHES, strict=False):
-                label = f"{name.split(', ')[1]}: {plan.schedule.duration:.3f} s, optimal control {plan.fastest.duration:.3f} s"
+                durations = f"{plan.schedule.duration:.3f} s, optimal control {plan.fastest.duration:.3f} s"
+                label = f"{name.split(', ')[1]}: {durations}"
                 thick: dict[str, Any] = {"ls": dash, "label": label}
                 thin: dict[str, Any] = {"lw": 0.8, "alpha": 0.8}
                 for one, style in ((plan.schedule, thick), (plan.fastest.schedule, thin)):
