@@ -124,6 +124,14 @@ def save(figure: Figure, path: Path) -> None:
             figure.savefig(temporary, format=ending[1:], metadata=metadata)
 
 
+def reduce_colors(path: Path, colors: int) -> None:
+    """Write a PNG anew with at most some colours, which makes a large picture of thin lines several times smaller."""
+    with Image.open(path) as picture:
+        reduced = picture.convert("RGB").quantize(colors, dither=Image.Dither.NONE)
+    with written(path) as temporary:
+        reduced.save(temporary, format="PNG", optimize=True)
+
+
 def caption(path: Path, title: str, note: str) -> None:
     """What is to be said of a picture, into a file beside it, NAME.caption.txt."""
     text = "\n\n".join(textwrap.fill(part, 120) for part in (title, note) if part)

@@ -64,6 +64,7 @@ def problems(path: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
                 continue
             for values in plan.states.values():
                 ax.plot(plan.t, values / np.abs(values).max(axis=0).clip(1e-12), lw=0.7)
+    drawing.reduce_colors(path, 128)
 
 
 if __name__ == "__main__":
