@@ -356,8 +356,8 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     file.add_argument("--names-confirmed", action="store_true", help="do not check for exchanged columns")
     limits = parser.add_argument_group("limits, besides those of the robot; rad, m, s, N; repeatable for each joint")
     each: dict[str, Any] = {"type": _limit, "action": "append", "default": [], "metavar": "[JOINT=]MAX"}
-    for name in (kind.replace("_", "-") for kind in CHECKED_LIMITS):
-        limits.add_argument(f"--{name}", help=f"largest {name.replace('-', ' ')}", **each)
+    for name in CHECKED_LIMITS:
+        limits.add_argument(f"--{name}", help=f"largest {name}", **each)
     limits.add_argument(
         "--share", type=float, default=LIMIT_SHARE, metavar="S", help="tolerance relative to a limit (default: 0.001)"
     )

@@ -260,8 +260,8 @@ def read_toml(file: FileName) -> TomlTable:
         match = ERROR_LINE.search(str(error))
         number = min(int(match[1]), len(texts)) if match else len(texts)
         why = ERROR_LINE.split(str(error))[0].strip() or str(error)
-        remedy = "remove one of the two" if "twice" in why or "overwrite" in why else "write name = value"
-        raise line_error(file, number, texts[number - 1], f"invalid TOML: {why}; {remedy}") from error
+        words = f"invalid TOML: {why}; write name = value, once for each name"
+        raise line_error(file, number, texts[number - 1], words) from error
     except (RecursionError, ValueError) as error:  # ValueError: also for numbers with more digits than Python accepts
         raise ProblemError(f"{file} is no TOML or nested too deeply: {error}", name="file", value=str(file)) from error
     return TomlTable(str(file), values, place=(), texts=texts, lines=_places(texts))

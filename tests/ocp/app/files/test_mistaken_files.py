@@ -47,8 +47,8 @@ def ends(folder: Path, capsys: Any, arguments: list[str]) -> str:
 @pytest.mark.parametrize(
     ("good", "bad", "expected"),
     [
-        ("speed = 0.1", "speed = 0.1\nspeed = 0.2", ("line 7", "speed = 0.2", "remove one")),
-        ("[output]", "[path]\n[output]", ("line 9", "[path]", "remove one")),
+        ("speed = 0.1", "speed = 0.1\nspeed = 0.2", ("line 7", "speed = 0.2", "once for each name")),
+        ("[output]", "[path]\n[output]", ("line 9", "[path]", "once for each name")),
         ("speed = 0.1", "speed = 0.1\naccel = 1", ("line 7", "did you mean acceleration?")),
         ("[search]", "[limits]\nvel = 1\n[search]", ("line 8", "did you mean velocity?")),
         ("[search]", "[Search]", ("line 7", "did you mean search?")),
