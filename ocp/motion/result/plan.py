@@ -27,6 +27,7 @@ from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times, values_within
 from ocp.motion.result.candidate import Candidate, Rejection, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
+from ocp.motion.tasks.checks import CHECKS
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
@@ -199,7 +200,7 @@ class Plan(ABC):
         """Return an audit with a further finding: how fast the joints move at the start and end of the motion."""
         ends = np.array([0.0, self.horizon])
         speeds = np.abs(self.at(ends)["rates"])
-        speeds[speeds <= LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0)] = 0.0
+        speeds[speeds <= max(LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0), CHECKS.still)] = 0.0
         end, joint = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))
         text = describe_ends(speeds, self.names, [self._unit(k) for k in range(len(self.names))])
         finding = Finding(ENDS, float(speeds[end, joint]), None, float(ends[end]), text or "at rest")
