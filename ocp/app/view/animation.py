@@ -281,7 +281,7 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     details |= _audit_verdict([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
     base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
     samples = MotionSamples(times, sample.joints, sample.rates, sample.accelerations, base, base_rates)
-    return _animation(name, plan.machine, samples, own_curves, **details)
+    return _animation(name, plan.machine, samples, own_curves, bounds=plan.joint_bounds, **details)
 
 
 def animate_solution(
@@ -360,9 +360,18 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
 
 
 def _animation(
-    name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
+    name: str,
+    machine: Machine,
+    samples: MotionSamples,
+    own_curves: Sequence[Curve],
+    *,
+    bounds: JointBounds | None = None,
+    **details: Any,
 ) -> Animation:
-    """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has."""
+    """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has.
+
+    `bounds` are the limits of the joints; those of the robot if None.
+    """
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -379,7 +388,7 @@ def _animation(
         inside = [curve for curve in own_curves if curve.group == ZMP_CONSTRAINT]
         footing, more = ground_contact(machine, samples, inside)
         curves += more
-    curves += joint_curves(machine, Limits().bounds(machine), samples)
+    curves += joint_curves(machine, bounds or Limits().bounds(machine), samples)
     curves += _margins([one for one in own_curves if one.group != "Cost"])
     return Animation(name, machine, t, samples.joints, samples.base, tuple(curves), footing=footing, **details)
 
