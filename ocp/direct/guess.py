@@ -18,6 +18,7 @@ from ocp.errors import ProblemError, error_names, require
 from ocp.problem.formulation import Bounds, Formulation, total
 from ocp.problem.values import middle_horizon, numeric, table
 from ocp.solution import Guess, Solution
+from ocp.solution_data import NODE_TOLERANCE
 from ocp.tolerances import ROUNDING_SHARE
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
@@ -167,7 +168,10 @@ class Samples:
 
 
 def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
-    """Return, by name, the trajectory of every state and control that an earlier solution shares with the problem."""
+    """Return, by name, the trajectory of every state and control that an earlier solution shares with the problem.
+
+    At a node, a control has the left limit: a control variable there belongs to the interval that ends there.
+    """
     shared: dict[str, Trajectory] = {}
     for name, entries in {**form.states, **form.controls}.items():
         values = guess.states if name in guess.states else guess.controls
@@ -178,7 +182,8 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
             raise ProblemError(
                 f"guess of {name!r} has {actual} entries, {size} expected", name=name, value=actual, limit=size
             )
-        shared[name] = lambda s, name=name: guess.at_fraction(s)[name]  # type: ignore[misc]
+        shift = NODE_TOLERANCE if name in guess.controls else 0.0
+        shared[name] = lambda s, name=name, shift=shift: guess.at_fraction(np.maximum(s - shift, 0.0))[name]  # type: ignore[misc]
     if not shared:
         words = f"the guess, plan {guess.name!r}, shares no state or control with problem {form.name!r}"
         raise ProblemError(words, name="guess", value=guess.name, limit=(*form.states, *form.controls))

@@ -38,8 +38,8 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
 
-SAMPLES_PER_INTERVAL = 16
-"""Number of samples of an initial guess in an interval of the mesh: the jerk of the guess is a difference of them."""
+GUESS_PLACES = np.append(ROUNDING_SHARE, np.arange(1, 17) / 16)
+"""Places, 0 to 1, in an interval of the mesh at which an initial guess is sampled: jerks jump between intervals."""
 
 
 class _Demand(NamedTuple):
@@ -198,15 +198,20 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
     rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
     ramps = _ramps(request, unlimited, limits, rest_rows)
-    mesh = _first_mesh(request, limits).with_nodes_at(np.unique(np.concatenate([ramps, *fractions])).tolist())
+    has_jerks = bool(np.isfinite(limits.bounds(request.machine).jerk).any() or (request.cost and request.cost.jerk))
+    # if the controls are jerks, and the time is fixed, tasks constrain states alone: a stiffly accurate scheme alone
+    # damps the errors of such equations, of index 2 (Hairer, Wanner 1996, section VII.4)
+    points = replace(POINTS, scheme="radau") if has_jerks and request.time_cost is None else POINTS
+    mesh = points.with_nodes_at(np.unique(np.concatenate([ramps, *fractions])).tolist())
     cost = unlimited.cost if request.cost is None else cost_of_motion(unlimited, request.cost)
     is_at_rest = cost <= request.settings.negligible_rate * request.stretches[-1].end
     settings = SolveSettings(mesh, cost=np.inf if is_at_rest else cost)
+    smoothing = Actuation.smoothing if is_at_rest else _smoothing(unlimited, mesh, cost, has_jerks)
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            actuation = Actuation(request.cost, request.rests, rest_rows)
+            actuation = Actuation(request.cost, request.rests, rest_rows, smoothing)
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited, mesh)
             return motion.problem
@@ -227,14 +232,42 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     return solution
 
 
-def _first_mesh(request: PlanRequest, limits: Limits) -> Collocation:
-    """Return the first mesh of a motion, without nodes at certain times.
+def _smoothing(unlimited: SolvedPlan, mesh: Collocation, cost: float, has_jerks: bool) -> float:
+    """Return the duration, as a share of the horizon, in which a control passes from limit to limit.
 
-    If the controls are jerks, and the time is fixed, the tasks constrain states alone. The errors of such equations, of
-    index 2, are damped by a stiffly accurate scheme only (Hairer, Wanner 1996, section VII.4).
+    It is the default unless the term of the cost that this duration stands for (see `declare_actuators`) then exceeds
+    the error that a cost may have, for the motion without actuator limits, which costs `cost`.
     """
-    jerks = np.isfinite(limits.bounds(request.machine).jerk).any() or (request.cost is not None and request.cost.jerk)
-    return replace(POINTS, scheme="radau") if jerks and request.time_cost is None else POINTS
+    fractions, squares = _guess_fractions(mesh), 0.0
+    for part in unlimited.parts:
+        times, controls = fractions * (part.end - part.begin), unlimited.accelerations(part, fractions.ravel())
+        controls = _slopes(controls, times) if has_jerks else controls
+        squares += float(np.trapezoid((controls**2).sum(axis=1), times.ravel()))
+    order, default = 4 if has_jerks else 2, Actuation.smoothing
+    most = 2.0 * LIMIT_SHARE * cost
+    return (
+        default
+        if most >= squares * (default * unlimited.horizon) ** order
+        else ((most / squares) ** (1 / order) / unlimited.horizon)
+    )
+
+
+def _guess_fractions(mesh: Collocation) -> Array:
+    """Return the fractions of the horizon at which a motion is sampled for a guess on a mesh of N intervals, from just
+    after the start of each interval to its end. Shape (N, M).
+    """
+    nodes = mesh.fractions
+    fractions = nodes[:-1, None] + np.diff(nodes)[:, None] * GUESS_PLACES
+    fractions[:, -1] = nodes[1:]
+    return np.asarray(fractions)
+
+
+def _slopes(values: Array, times: Array) -> Array:
+    """Return time derivatives of the samples (N M, n) of N intervals, by differences inside the intervals. `times` has
+    the shape (N, M). Same shape as the values.
+    """
+    slopes = np.gradient(values.reshape(*times.shape, -1), GUESS_PLACES, axis=1)
+    return np.asarray(slopes / np.gradient(times, GUESS_PLACES, axis=1)[:, :, None]).reshape(values.shape)
 
 
 def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
@@ -284,8 +317,7 @@ def _add_demand(error: SolveError, demand: Reason | None) -> None:
 
 def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> None:
     """Set the initial guess of the states and controls of a problem to a motion that ignores actuator limits."""
-    nodes, places = mesh.fractions, np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
-    fractions = np.append(nodes[:-1, None] + np.diff(nodes)[:, None] * places, 1.0)
+    shape, fractions = (mesh.intervals, len(GUESS_PLACES)), _guess_fractions(mesh).ravel()
     sample = unlimited.solution.at_fraction(fractions)
     pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0
     for stretch, part in zip(motion.stretches, unlimited.parts, strict=True):
@@ -296,7 +328,7 @@ def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> 
             "joints": sample[f"joints{stretch.suffix}"],
             "velocities": sample[unlimited.rate_name + stretch.suffix] / pace,
             "accelerations": accelerations,
-            "jerks": np.gradient(accelerations, times, axis=0),
+            "jerks": _slopes(accelerations, times.reshape(shape)),
         }
         named = {name + stretch.suffix: values for name, values in values_by_name.items()}
         for name, values in {**named, CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}.items():

@@ -246,3 +246,19 @@ def test_a_solution_that_shares_nothing_or_has_another_size_is_named() -> None:
         problem.horizon(1.0)
         with pytest.raises(ProblemError, match=message):
             solve(problem, Collocation(2), guess=plan)
+
+
+def test_a_plan_on_a_finer_mesh_keeps_its_control_on_both_sides_of_a_jump() -> None:
+    """The last Radau point of an interval is its end, where the control of the next interval may be another one."""
+    problem = Problem("least time")
+    x, v = problem.state("x", initial=0.0, terminal=1.0), problem.state("v", initial=0.0, terminal=0.0)
+    u = problem.control("u", lower=-4.0, upper=4.0)
+    problem.dynamics(x, v)
+    problem.dynamics(v, u)
+    problem.minimize(terminal=problem.horizon(lower=0.1, upper=5.0, guess=1.0))
+    method = Collocation(2, degree=3, scheme="radau")
+    plan = solve(problem, method)
+    assert plan.horizon == pytest.approx(1.0, abs=1e-5)
+    finer, point = start(problem, method.halve(), plan)
+    at, values = entries(finer, point, "control", 0)
+    np.testing.assert_allclose(values, np.where(at <= 0.5, 4.0, -4.0), atol=1e-3)

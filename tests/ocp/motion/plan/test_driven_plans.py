@@ -29,6 +29,7 @@ from ocp.app.files import read_waypoints
 from ocp.motion.builders.dynamics_plan import POINTS
 from ocp.motion.plan.actuators import largest_demand
 from ocp.motion.result.solved_plan import SolvedPlan
+from ocp.tolerances import LIMIT_SHARE
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
 from tests.ocp.motion.builders.test_dynamics import torques_along
@@ -114,6 +115,18 @@ def line_task(acceleration: float = 0.5, jerk: float = 4.0) -> TipTask:
     """Along y with a free roll about the last axis of the arm, so that the task determines all other joints."""
     path = smooth(CornerPath.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3)]), 0.002)
     return TipTask.along(path, 0.1, acceleration=acceleration, jerk=jerk, direction=(0, 0, -1))
+
+
+@pytest.mark.long
+def test_slow_tools_with_short_ramps_cost_what_they_cost_without_limits_that_are_inactive() -> None:
+    """The ramps last a thousandth of the motion: less than the time in which jerks would else be smoothed."""
+    path = smooth(CornerPath.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3), (0.45, 0.12, 0.3)]), 0.002)
+    task = TipTask.along(path, 0.004, direction=(0, 0, -1))
+    free = plan(SIX_AXIS, task, search="start")
+    result = plan(SIX_AXIS, task, search="start", limits=Limits(acceleration=8.0, jerk=100.0))
+    assert result.audit().feasible
+    assert free.cost <= result.cost <= (1 + 2 * LIMIT_SHARE) * free.cost
+    np.testing.assert_allclose(result.sampled(np.array([0.0, result.horizon])).rates, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("quantity", ["acceleration", pytest.param("jerk", marks=pytest.mark.long)])
