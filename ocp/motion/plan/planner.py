@@ -50,8 +50,8 @@ from ocp.motion.search.held_joints import (
     release_obstructing,
     restore_error,
 )
-from ocp.motion.search.search import checked_bound
-from ocp.motion.search.task_search import TaskSearch
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, checked_bound
+from ocp.motion.search.task_search import TaskSearch, tool_rate_bound
 from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
@@ -84,9 +84,14 @@ def plan_from_configurations(
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
         return _final_plan(queue, solver), None
-    if request.search == "global":
+    if request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS:
+        queue.run(candidates_from(solver, motions), include_costlier=True)
+        if queue.passed:
+            return _final_plan(queue, solver), tool_rate_bound(request) or None
+    search = None
+    if request.search == "global" and request.redundancy <= MAX_FREE_DIRECTIONS:
         report("global search")
-    search = TaskSearch(request, motions) if request.search == "global" else None
+        search = TaskSearch(request, motions)
     if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:

@@ -172,6 +172,12 @@ class PlanRequest:
         own = IkOptions(base=self.base, limits=self.limits.joints)
         return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
+    @property
+    def redundancy(self) -> int:
+        """Largest number of degrees of freedom that the active tasks leave undetermined; that of no task is unknown."""
+        sizes = [stretch.equations.size for stretch in self.stretches if stretch.equations is not None]
+        return self.machine.joint_size - min(sizes, default=0)
+
     @cached_property
     def bounds(self) -> JointBounds:
         """Position and rate limits of the machine's joints as arrays."""

@@ -119,12 +119,14 @@ class DeadEnd(SolveError):
         obstructions: Constraints that stop motions there, each kind and name with its least excess, the least first.
         relaxations: Motions that would do the task with a relaxed requirement, the smallest one found of each kind.
         segments: Number of segments in which the task may be done, see `plan`, search="segments"; None if unknown.
+        proven: Whether the search proves, under its assumptions, that no motion exists.
     """
 
     until: float
     obstructions: tuple[Obstruction, ...]
     relaxations: tuple[Relaxation, ...]
     segments: int | None
+    proven: bool
 
     def __init__(
         self,
@@ -134,10 +136,12 @@ class DeadEnd(SolveError):
         relaxations: tuple[Relaxation, ...] = (),
         *,
         segments: int | None = None,
+        proven: bool = False,
         **details: Any,
     ) -> None:
         super().__init__(words, **details)
-        self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
+        self.until, self.obstructions, self.relaxations = until, obstructions, relaxations
+        self.segments, self.proven = segments, proven
 
     def __reduce__(self) -> Any:
         """Return the data from which `pickle` rebuilds the error: its class, arguments and fields."""
@@ -151,8 +155,7 @@ def dead_end(
 
     Args:
         unit: Format of the sample times in the message.
-        proven: Whether the search proves, under its assumptions, that no motion exists.
-        segments: As in `DeadEnd`.
+        proven, segments: As in `DeadEnd`.
     """
     front = _Propagation(search)
     last = front.last
@@ -182,8 +185,9 @@ def dead_end(
         count = "a reconfiguration" if segments == 2 else f"{segments - 1} reconfigurations"
         words += f"; with {count} on the way one may: search='segments'"
     time, until = float(search.times[max(last, 0)]), float(search.times[last + 1])
-    details = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
-    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments=segments, **details)
+    details: dict[str, Any] = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
+    details |= {"segments": segments, "proven": proven}
+    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), **details)
 
 
 class _Propagation:

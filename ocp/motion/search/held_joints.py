@@ -265,8 +265,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
         request: The request, without idle joints.
         configurations: Its joints at the start. Shape (K, n).
     """
-    sizes = [stretch.equations.size for stretch in request.stretches if stretch.equations is not None]
-    excess = request.machine.joint_size - min(sizes, default=0) - MAX_FREE_DIRECTIONS
+    excess = request.redundancy - MAX_FREE_DIRECTIONS
     columns = _shared_joints(request)[: max(excess, 0)]
     if request.search != "global" or request.machine.base_size or excess <= 0 or len(columns) < excess:
         return request
