@@ -217,7 +217,7 @@ def solve_with_clearance(
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a constraint name, with or without the name of a phase in front, denotes a clearance."""
+    """Return whether a name, with or without the name of a phase in front, is that of a clearance constraint."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 

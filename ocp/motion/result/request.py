@@ -73,7 +73,7 @@ TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingO
 
 
 def _machine_of(arguments: Mapping[str, Any]) -> Machine:
-    """Return the machine among the arguments of a problem builder."""
+    """Return the machine that a problem builder's arguments contain."""
     if "steps" in arguments:
         steps: Steps = arguments["steps"]
         return steps.stances[0]

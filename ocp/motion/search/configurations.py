@@ -243,7 +243,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Return text for an error message about the number of collision-free configurations; [] if it is unknown."""
+    """Return a list with one text about the number of collision-free configurations; empty if it is unknown."""
     if count is None:
         return []
     if isinstance(count, Unreachable):
@@ -298,7 +298,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Shift motions by full turns into the joint limits; track a motion again, within limits, if no shift suffices."""
+    """Shift motions by full turns into the joint limits; track a motion anew within limits if no shift suffices."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -322,7 +322,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the configurations nearest to `joints` (K, n) that satisfy the tasks of two adjoining time intervals."""
+    """Return the configurations nearest to `joints` (K, n) that satisfy the tasks before and after a time."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
@@ -362,7 +362,7 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
-    """Return the error with a time, s, and the positions that the tasks require at this time, added to its message."""
+    """Return an error whose message also states a time, s, and the positions that the tasks require at this time."""
     places = []
     for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
@@ -394,7 +394,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """Inverse kinematics of tasks at successive times; each solve starts from the solutions at the previous time."""
+    """Inverse kinematics of tasks at successive times, each started from the solutions at the time before."""
 
     equations: TaskEquations
     options: dict[str, Any]

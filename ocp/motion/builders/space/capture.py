@@ -296,7 +296,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factor that multiplies each joint position as the detumbling starts: 0 for reaction wheels, else 1."""
+        """Factor that multiplies each joint position at the start of the detumbling: 0 for reaction wheels, else 1."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -372,7 +372,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
+        """Return the base configuration at a time: its position follows from uniform motion of the centre of mass.
 
         The dynamics conserve this motion and the norm of the quaternion. Their continuity would be a condition that no
         control influences, and would leave the second-order conditions undetermined.

@@ -399,7 +399,7 @@ def _error_of_tips(
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:
-    """Return whether an audit finding concerns variable bounds or a path constraint without equations."""
+    """Return whether an audit finding concerns bounds of variables, or a path constraint of inequalities only."""
     rows = problem.declared.path.get(finding)
     if rows is None:
         return finding.startswith("bounds of ")
