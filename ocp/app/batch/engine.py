@@ -88,7 +88,7 @@ def failure_payload(status: str, error: str, message: str) -> Payload:
 
 
 def message_of(error: BaseException) -> str:
-    """Return the message of an exception; unless this package raised it, with the file and line of its origin."""
+    """Return the message of an exception, and the file and line of its origin unless this package raised it."""
     words = str(error).encode("utf-8", "replace").decode()
     if isinstance(error, DetailedError | ModelError):
         return words

@@ -249,7 +249,7 @@ class Motion:
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Rounding errors of positions, velocities and accelerations: half of the last digit. Shape (n,) each."""
+        """Rounding errors of positions, velocities, accelerations: half a unit in the last digit. Shape (n,) each."""
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 

@@ -255,7 +255,7 @@ def smooth_path(
 
 
 class ProgramMotion(NamedTuple):
-    """Motion of a program at M sample times.
+    """Motion of the tool in a machine-tool program at M sample times.
 
     Attributes:
         t: Sample times. Shape (M,), s.

@@ -90,7 +90,7 @@ class TableRow(NamedTuple):
 
     @property
     def has_names(self) -> bool:
-        """Whether a cell is neither empty nor a number, so that the row may name the columns."""
+        """Whether a cell of the row is neither empty nor a number, so that the row may name the columns."""
         return any(cell and not is_number(cell) for cell in self.cells)
 
 

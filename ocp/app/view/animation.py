@@ -427,7 +427,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 
 
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
-    """Return the closest pair of bodies at uniform times of a motion, or None if the pairs are unknown.
+    """Return the closest pair of bodies at evenly spaced times of a motion, or None if the pairs are unknown.
 
     `parts` are solutions, suffixes and times as returned by `Plan.solved_parts` for these times.
     """

@@ -232,7 +232,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate a function that accepts only SX expressions of base, joints and time, also for MX expressions."""
+    """Evaluate a function of base, joints and time that accepts only SX expressions, for MX expressions as well."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

@@ -108,7 +108,7 @@ class PlannedJoints:
         return _Along(*(self.curves(places, order) for order in range(4)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return inertia, drag and rest terms of the joint torques at path distances (M,), m. Shape (M, n) each.
+        """Return coefficients of the joint torques (inertia, drag, rest) at path distances (M,), m. Shape (M, n) each.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.

@@ -150,7 +150,7 @@ def largest_changes(
 
 
 def _has_exact_depth(first: Hull, second: Hull) -> bool:
-    """Return whether the penetration depth of two bodies is exact: of segments and boxes, and of half-spaces."""
+    """Return whether the penetration depth of two bodies is computed exactly: for half-spaces, segments and boxes."""
     return bool(first.normal.size or second.normal.size) or max(first.kind, second.kind) <= 2
 
 

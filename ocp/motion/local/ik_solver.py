@@ -347,7 +347,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
-    """Return the solvers of an arm, if any, and its auxiliary joints; orientation is free about `axes` (k, 3)."""
+    """Return the pose solvers of an arm, if any, and its auxiliary joints; the tip may rotate about `axes` (k, 3)."""
     extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):

@@ -94,7 +94,7 @@ def _moving_joints(plan: SolvedPlan) -> tuple[Any, Array, tuple[Array, ...]]:
 
 
 def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return the reason that describes a plan's largest demand on an actuator, relative to its limit, or None.
+    """Return a `Reason` with a plan's largest demand on an actuator, relative to the limit; None without limits.
 
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.

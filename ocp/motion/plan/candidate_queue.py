@@ -197,7 +197,7 @@ class CandidateQueue:
         return None
 
     def _prune(self, candidate: Candidate) -> Reason | None:
-        """Return the reason why a candidate need not be advanced; None if the candidate must be advanced."""
+        """Return the reason not to solve a candidate any further; None if it must be solved further."""
         settings, stage, best = self.settings, candidate.stage, self.cost
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):

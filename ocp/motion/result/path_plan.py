@@ -166,7 +166,7 @@ class PathPlan(Plan):
         return Audit("path through waypoints", tuple(findings + optimality), undecided, **options)
 
     def _optimality(self) -> tuple[list[Finding], str]:
-        """Return the finding on first-order conditions, and the reason why a local minimum is undetermined, or ""."""
+        """Return the finding on first-order optimality, and the reason why a local minimum is undetermined, or ""."""
         if self.poses is None or self.step_cost is None:
             return [], "the cost of its steps is unknown"
         scene = None if self.constraints is None else self.constraints.scene

@@ -335,7 +335,7 @@ class Plan(ABC):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a plan from a file that `save` has written; candidates other than the plan have no solutions.
+        """Read a plan from a file that `save` has written; candidates other than the plan come without solutions.
 
         The problem is declared again from the request by the planner's own code, so that the audit checks the motion
         against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as

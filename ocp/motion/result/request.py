@@ -140,7 +140,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request, and store the request in it, so that files can rebuild it.
+    """Declare the problem of a request, and store the request in the problem, so that files can rebuild the problem.
 
     Args:
         request: The request.

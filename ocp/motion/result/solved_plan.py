@@ -241,7 +241,7 @@ class SolvedPlan(Plan):
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control with respect to the horizon fraction. Shape (M, n)."""
+        """Return the derivative of a state or control with respect to the fraction of the horizon. Shape (M, n)."""
         is_state = name in self.solution.states
         pool = self.solution.states if is_state else self.solution.controls
         interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
@@ -292,7 +292,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def machines(self) -> tuple[Machine, ...]:
-        """Machine of each phase; the first phase's machine for all phases if the user declared the problem."""
+        """Machine of each phase; if the user declared the problem, the machine of the first phase for all phases."""
         machines = machines_of_phases(self.request)
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 

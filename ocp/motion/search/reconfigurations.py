@@ -164,7 +164,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the farthest time sample to which a path from `start` leads, or None; `back` searches backwards."""
+    """Return the farthest time sample that a path from `start` reaches, or None; `back` searches backwards in time."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)

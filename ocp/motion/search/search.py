@@ -465,7 +465,7 @@ class AtlasSearch:
         return valid
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
-        """Shorten a path on the manifolds if the result is valid; return None if the path then exceeds step limits."""
+        """Shorten a path on the manifolds unless that makes it invalid; return None if it still exceeds step limits."""
         if path is None:
             return None
         if self.start is None:

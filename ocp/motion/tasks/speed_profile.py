@@ -24,7 +24,7 @@ Phases = tuple[tuple[float, float], ...]  # durations (s) and jerks (m/s^3) of c
 
 
 class LineMotion(NamedTuple):
-    """Motion along a path at M times: distance covered and its derivatives, in s and m. Shape (M,) each."""
+    """Motion along a path at M times: distance, speed, acceleration and jerk, in s and m. Shape (M,) each."""
 
     t: Array
     distance: Array

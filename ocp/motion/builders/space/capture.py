@@ -202,7 +202,7 @@ def solve_capture(
     method: Collocation = POINTS,
     **options: Any,
 ) -> Solution:
-    """Solve `capture_problem` with its options within its limits everywhere, first on the mesh `method`."""
+    """Solve `capture_problem` so that limits hold between the mesh nodes as well, starting on the mesh `method`."""
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:
         return capture_problem(chaser, capture, clearance_constraints=constraints, **options)
@@ -387,7 +387,7 @@ class _Capture:
 
 
 def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joint positions, joint velocities and base configuration at the end of the guess of an approach."""
+    """Return joint positions, joint velocities and base configuration at the end of an approach's initial guess."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)

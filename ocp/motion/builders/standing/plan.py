@@ -99,7 +99,7 @@ def guess_in_time(
 def _extensible_problem(
     steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> Phases:
-    """Declare the problem of footsteps that may take longer than requested, at a cost above all others."""
+    """Declare the problem of footsteps that may take longer than requested, at a cost that outweighs all others."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
