@@ -168,7 +168,7 @@ class TomlTable:
         return {name: value for name, value in values.items() if value is not None}
 
     def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
-        """Return `kind` called with entries of the table and further arguments; errors that it raises name the line."""
+        """Return `kind` called with entries of the table and other arguments; errors of `kind` name the line."""
         values = self.values(readers) | arguments
         self.done()
         with located_errors(self):
@@ -234,7 +234,7 @@ class TomlTable:
         self.done()
 
     def done(self) -> None:
-        """Raise ProblemError if the table has an entry that was not read; it names the line and the known entries."""
+        """Raise ProblemError if the table has an unread entry; the error names its line and all known entries."""
         for name in self._values:
             if name not in self._read_names:
                 similar, known = checks.similar_names(name, self._read_names), dict.fromkeys(self._read_names)

@@ -142,7 +142,7 @@ class _TaskHierarchy:
 
 
 def _check_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a law is unknown or, with `size` rows of tasks, needs more joints than the machine has."""
+    """Raise ProblemError if a control law is unknown, or needs more joints for `size` task rows than there are."""
     require.choice("law", law, get_args(Law))
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}

@@ -324,7 +324,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return straight motions in joint space from the starts of these motions to (K, joint_size) configurations."""
+        """Return straight motions in joint space from the starts of these motions to configurations (K, joint_size)."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)

@@ -72,7 +72,7 @@ class Reason:
 
     @property
     def fault(self) -> dict[str, Any]:
-        """Name, value, limit and time of the violated item, as a dictionary of an exception's fields."""
+        """Name, value, limit and time of the violation, as a dictionary of the fields of an exception."""
         return {name: getattr(self, name) for name in ("name", "value", "limit", "time")}
 
     def __str__(self) -> str:

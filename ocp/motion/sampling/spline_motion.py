@@ -323,7 +323,7 @@ class _Search:
         return np.asarray(breaks)
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix (M, K) from control points to values of a derivative at M fractions of the duration."""
+        """Return the matrix (M, K) that maps control points to a derivative at M fractions of the duration."""
         knots = self.knots[order : len(self.knots) - order]
         return scipy.interpolate.BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
@@ -421,7 +421,7 @@ class _Search:
             yield sign * matrix[rows], sign * by_duration.ravel()[rows], sign * usages, (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Convert derivatives of constraints by joint positions (R, n) to their Jacobian in the control points.
+        """Convert the Jacobian (R, n) of constraints in the joint positions to the Jacobian in the control points.
 
         `basis` has the values of the K basis functions at the sample of each constraint. Shape (R, K).
         """

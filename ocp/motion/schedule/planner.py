@@ -156,7 +156,7 @@ def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower, in place, the speed limits of intervals in which a speed profile is too fast; return whether any was."""
+    """Lower, in place, the speed limits of intervals where a profile is too fast; return whether any was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()

@@ -223,7 +223,7 @@ class EnforcedRows:
         self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce limits at the point of an interval where each is nearest; return which were enforced there before.
+        """Enforce each limit at its point of highest usage in an interval; return which were enforced there before.
 
         Masks of shape (2, N, K + L + P).
         """
@@ -263,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
+    """Return the largest ratio of each quantity to its limit in given intervals, and those where limits are enforced.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 

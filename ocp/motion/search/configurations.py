@@ -322,7 +322,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the configurations nearest to `joints` (K, n) that satisfy the tasks before and after a time."""
+    """Return the configurations nearest to `joints` (K, n) that satisfy the tasks of two adjoining time intervals."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints

@@ -227,7 +227,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Propagate configurations from time sample `k` to the charts of sample `k` + 1, by falling clearance."""
+        """Propagate configurations from time sample `k` to charts of sample `k` + 1, in order of falling clearance."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]

@@ -126,7 +126,7 @@ class PathProblem:
 
     @property
     def weights(self) -> Array:
-        """Weights of the joint displacements in the cost of a step, a multiple of its length. Shape (n,)."""
+        """Weights of joint displacements in the cost of a step, which is proportional to the length. Shape (n,)."""
         assert isinstance(self.steps.cost, Homogeneous)
         return self.steps.cost.weights
 

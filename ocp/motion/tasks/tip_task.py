@@ -219,7 +219,7 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices, 0..5, of the components of the tip's twist that the task prescribes, without a tool direction."""
+        """Indices, 0..5, of the prescribed components of the tip's twist; a prescribed tool direction adds no index."""
         return tuple(self.rows or ())
 
     @property

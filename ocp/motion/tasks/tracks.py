@@ -246,7 +246,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, label: str) -> Any:
-    """Evaluate a target function; raise ProblemError if it fails, except for errors that SX symbols cause."""
+    """Evaluate a target function; raise ProblemError if it fails, but pass on errors that are due to SX symbols."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

@@ -234,7 +234,7 @@ def _constrain_swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of the distinct rows of a constraint; in planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint; rows of sole corners coincide in planar machines."""
     values = _at_random(rows, joints)
     return [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
 
