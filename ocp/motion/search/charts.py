@@ -130,7 +130,7 @@ def concatenate(parts: list[Charts]) -> Charts:
 
 
 class SplitCharts(NamedTuple):
-    """Charts of half the radius, with the indices of the charts that they replace.
+    """Charts of half the radius on a self-motion manifold, with the indices of the charts that they replace.
 
     Attributes:
         charts, owners: N charts, and the indices of the charts that they replace, (N,).

@@ -217,7 +217,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target pose of a task, or the integral of its target velocity, is not periodic."""
+    """Raise ProblemError if a task's target pose, or the integral of its target velocity, does not end as it begins."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in equations.by_task(values):
         task = part.task
