@@ -376,7 +376,7 @@ def _goal_problem(
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read a plan of any kind from a file; see `Plan.load`."""
+    """Read a plan of any kind from a file that `Plan.save` has written."""
     arrays = read_arrays(path)
     if "path" in arrays:
         return PathPlan.of_arrays(path, arrays)

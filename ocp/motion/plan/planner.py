@@ -109,7 +109,7 @@ def plan_from_configurations(
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the candidate that costs least by the cost function of the request.
+    """Return the plan of the candidate that costs least in terms of the cost function of the request.
 
     If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
     their costs before. If no motion passed, raise SolveError.
@@ -214,7 +214,7 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
 
 def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
-    """Solve the motions of a global search; return whether a plan costs so little that none of them promises less.
+    """Solve candidates from a global search; return whether one has passed and no other one promises to cost less.
 
     Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
     free start and, at last, with relaxed tasks.
@@ -240,7 +240,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
+    """Solve candidates of a floating-base machine, from a forward search over grid cells and from local motions.
 
     If there are none, raise the error of the `CellSearch`.
     """

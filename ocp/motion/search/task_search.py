@@ -209,7 +209,7 @@ class TaskSearch:
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
-        """Mask of the steps between time samples that are long enough to be subdivided."""
+        """Mask of the intervals between time samples that are long enough to be subdivided."""
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
@@ -218,15 +218,15 @@ class TaskSearch:
 
     @property
     def near_cost(self) -> float:
-        """Cost up to which a motion counts as close to the bound: twice the gap at which the search ends."""
+        """Cost below which a motion counts as close to the bound: twice the relative gap that ends the search."""
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return cost bound, time and configuration of each class of motions below a `cost` without a known path."""
+        """Return cost bound, time and configuration of motion classes without a path that may cost below `cost`."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
-        """Add time samples where the best path is near a limit, or `everywhere`, and search again.
+        """Add time samples where the best path is near a limit (or `everywhere`), and search again.
 
         Returns:
             Whether any were added.
@@ -282,7 +282,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose few times of a motion so that straight steps between them cost at most the fraction `share` less than it.
+    """Choose few times of a motion, such that straight steps between them cost nearly as much as the motion.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.
