@@ -291,7 +291,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Attach the problem from the same file to the plan, and return the plan; raise ProblemError if they differ."""
+        """Return the plan with the problem of its file attached; raise ProblemError if their variables do not match."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:

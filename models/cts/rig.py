@@ -237,7 +237,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
-    """Return the rig's configuration for a target and a roll angle, by equations (23), (25), (27) of Lee, Lee 2017."""
+    """Return the joint positions of the rig for a tool pose and a roll angle about the tool axis, in closed form."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link

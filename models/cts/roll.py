@@ -361,7 +361,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return a CasADi Function that approximates cosines and sines, (2, 8), of rolls at which joint 1 is at a limit."""
+    """Return a CasADi Function for the roll angles (8 cosines and sines) at which the prismatic joint is at a limit."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)

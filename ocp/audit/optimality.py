@@ -402,7 +402,7 @@ def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.nda
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return a plan's excess cost over the optimum for given multipliers, except that of a free initial state."""
+    """Sum the estimated excess costs over the optimum of all intervals and of the end, for given multipliers."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 

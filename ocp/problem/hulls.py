@@ -187,9 +187,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the R pairs of shapes to evaluate for K pairs of bodies, as indices into `pair` and into `rows`.
+        """Return the pairs of convex shapes whose distances are evaluated for K pairs of bodies, as indices (R,) twice.
 
-        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
+        They are indices into `pair` and into `rows`. The K pairs come first, then the shapes that cover their bodies.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)

@@ -126,7 +126,7 @@ def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointB
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
-    """Return the largest demand beyond a limit on joints whose motion the tasks determine; None if none is exceeded.
+    """Return the most exceeded limit of joints whose motion the tasks determine; None if they exceed none.
 
     The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
     moves at a random configuration is not moved at almost all configurations: the tasks determine its motion. Divided

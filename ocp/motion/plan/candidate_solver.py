@@ -235,7 +235,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return [a copy with a free start] if a candidate with a fixed start passed its audit, else an empty list."""
+        """Return a candidate whose guess is an audited motion with a fixed start, but whose start is free; else []."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints

@@ -286,7 +286,7 @@ class _PathProblem:
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the optimal control problem of a motion between the ends of the path, with or without clearance."""
+        """Declare the problem of an optimal motion between the ends of the path, with clearance constraints or none."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()

@@ -389,7 +389,7 @@ class _WaypointPlanner:
         return self._seed_cache[number]
 
     def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
-        """Interpolate joint positions at all waypoints, and shift them by full turns into the limits. Shape (N, n)."""
+        """Interpolate the configurations (N, n) of all waypoints between those that were searched, within limits."""
         numbers = np.arange(len(self.positions))
         path = np.concatenate([segment.joints for segment in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])

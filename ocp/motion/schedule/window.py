@@ -168,7 +168,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return the limits of a window, none of them enforced yet, with the initial usable fraction of each limit."""
+        """Return the limits of a part of the path (window), none of them enforced yet, with initial margins."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -373,7 +373,7 @@ def _fine_usage(
 
 
 def parabola_peak(values: Array, places: Sequence[Array | float]) -> Array:
-    """Return the extreme value of the parabola through three points if it is between them, else the first value."""
+    """Return the extreme value of a parabola between the first and last of three points, or the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

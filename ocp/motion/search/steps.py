@@ -380,7 +380,7 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
 
 
 def _separate(square: Array) -> Array:
-    """Return diagonal lower bounds (r, r, P) of symmetric matrices by Gershgorin's theorem; unchanged if r < 3.
+    """Return lower bounds of symmetric matrices (r, r, P): diagonal ones by Gershgorin's theorem, themselves if r < 3.
 
     Each mixed term is at least minus the mean of both squares.
     """

@@ -222,7 +222,7 @@ class TaskSearch:
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return cost bound, time and configuration of motion classes without a path that may cost below `cost`."""
+        """Return bound, time and joints of the classes of motions that may cost less than `cost`, but have no path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:

@@ -182,7 +182,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the numbers that messages use for the task equations: twist components 0..5 of one task, else indices."""
+    """Return the row numbers by which messages name the task equations: twist components 0..5 if there is one task."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)

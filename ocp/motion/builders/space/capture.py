@@ -296,7 +296,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factor that multiplies each joint position at the start of the detumbling: 0 for reaction wheels, else 1."""
+        """Mask of the joints of the arm: 1, but 0 for reaction wheels, whose angles start at 0 in the detumbling."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
