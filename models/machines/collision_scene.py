@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason why a pair of links that seems to collide always is not checked, keyed by "A and B" (link names)."""
+        """Reasons why pairs of links that seem to collide permanently are not checked, by "A and B" (link names)."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value

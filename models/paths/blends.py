@@ -171,7 +171,9 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the shape factors, (V,), of least peak curvature of quintic blends between two lines at given angles."""
+    """Return the shape factors, (V,), for which quintic blends between two lines at given angles have the least peak
+    curvature. A shape factor is the length of the end tangents over the distance from vertex to blend ends.
+    """
     angles, shape_over_chord = _table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 

@@ -98,7 +98,7 @@ class Spline:
 
     @property
     def normal(self) -> Array:
-        """Zero vector, because only curves of constant curvature are computed from their normal. Shape (3,)."""
+        """Zero vector, since points of a spline, unlike those of an arc, are computed without a normal. Shape (3,)."""
         return np.zeros(3)
 
     @cached_property

@@ -257,7 +257,7 @@ def _segment_box_square(
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return, for each of three components, 1 if its magnitude is the largest relative to its size, else 0."""
+    """Return 1 for that of three components with the largest ratio of magnitude to its entry in `sizes`, else 0."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])

@@ -80,7 +80,7 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """For upper, then lower limits: mask of possibly active limits (equalities once), distances, and sign."""
+        """Mask of possible activity, distances, multiplier sign of upper limits and equalities, then of lower ones."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:

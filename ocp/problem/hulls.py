@@ -187,9 +187,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of convex shapes whose distances are evaluated for K pairs of bodies, as indices (R,) twice.
+        """Return R pairs of shapes to evaluate: the index of each one's pair of bodies in `pair`, its own in `rows`.
 
-        They are indices into `pair` and into `rows`. The K pairs come first, then the shapes that cover their bodies.
+        The first of them are the K pairs of bodies in `pair`; then come the shapes that cover these bodies.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)

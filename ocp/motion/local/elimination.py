@@ -121,11 +121,11 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip, and masks of poses to be confirmed and of incomplete ones.
+        """Return the IK solutions at M poses, and masks of poses where completeness is to be confirmed, or doubtful.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
-        number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
-        confirmed. Such poses are solved with further openings.
+        number of solutions were found. Multiple eigenvalues mix the products of several solutions; completeness is then
+        to be confirmed. Such poses are solved with further openings.
         """
         prescribed, count = self.prescribe(redundant), len(tips.shift)
         even, solutions = bool(self.chain.revolute[self.free].all()), Solutions.none(len(self.chain.axes))

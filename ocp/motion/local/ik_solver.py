@@ -399,7 +399,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """Solver of all IK configurations of a pose task at a time, for samples of its free parameters."""
+    """Solver of all IK configurations for given targets of a pose task, at samples of the parameters that are free."""
 
     def __init__(self, equations: TaskEquations, arm: ArmSolver) -> None:
         self.arm, self.complete = arm, arm.complete

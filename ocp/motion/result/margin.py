@@ -223,7 +223,7 @@ class _Stacked(NamedTuple):
         return Range(float(factors[row]), str(self.labels[row]), float(self.times[row]), row)
 
     def grow(self, weights: Mapping[str, float], stated: list[str]) -> tuple[dict[str, float], list[Range]]:
-        """Return the sizes of uncertainties that are allowed at the same time, and the limits that bound them in turn.
+        """Enlarge all uncertainties until limits stop them; return their sizes, and these limits in the order reached.
 
         All grow in proportion to their weights: first the stated ones, up to their weights if there are others, then
         the others. An uncertainty stops at the first requirement that allows no more of it.

@@ -271,10 +271,10 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(
     profile: SpeedProfile, samples: _Samples, places: tuple[NDArray[np.intp], ...], requested: Array
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of a quantity to its limit at four points of each interval (4, N), and inside it (N,).
+    """Return the largest ratio to its limit of a quantity except jerk: at four points and over each interval.
 
-    The places are the start, the first Gauss point, the middle and the end. Each row is interpolated by a parabola
-    through the others; its error at the Gauss point, where the error of a cubic is largest, is added.
+    The points are the start, the first Gauss point, the middle and the end. A parabola through the others interpolates
+    each row; its error at the Gauss point, where that of a cubic is largest, is added. Shapes (4, N) and (N,).
     """
     start, end, h = *(profile.distance[part] for part in (slice(-1), slice(1, None))), np.diff(profile.distance)
     inside = profile.at_distance(np.concatenate([start + GAUSS[0] * h, start + h / 2]))
@@ -389,7 +389,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest constant jerk that limits permit in the interval at rest, the first (side 0) or last."""
+    """Return the greatest constant jerk permitted from rest in the first interval (side 0), or to rest in the last."""
     interval, sign, ratio = -side, 1.0 - 2.0 * side, 0.0
     for s in (0.0, width):
         for rows in (left, right):

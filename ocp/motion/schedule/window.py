@@ -143,7 +143,7 @@ class Margins(NamedTuple):
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the usable fractions of the limits, multiplied by one factor for each interval (N,)."""
+        """Return a copy in which the fractions of the limits are multiplied by one factor for each interval (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 

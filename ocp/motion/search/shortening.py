@@ -119,7 +119,7 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Distinct manifolds, each with the path indices of its time samples and with their rows in the manifolds."""
+        """Sets of manifolds, each with the indices of its samples along the path and the rows of these in the set."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]

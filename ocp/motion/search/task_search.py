@@ -373,7 +373,7 @@ def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, b
     rows = np.flatnonzero(np.isfinite(rates).all(axis=1))  # a joint that costs nothing takes the tool along
     if not rows.size:
         return 0.0
-    limits, count = cost.pool(rates[rows].T), len(rows)
+    limits, count = cost.dual_terms(rates[rows].T), len(rows)
     planes, right = np.vstack([limits, np.eye(count)]), np.append(np.ones(len(limits)), np.zeros(count))
     corners = np.array([*combinations(range(len(planes)), count)])
     corners = corners[np.abs(np.linalg.det(planes[corners])) > 0]
@@ -440,7 +440,7 @@ class _ToolLevers:
 
     @classmethod
     def of(cls, machine: Machine, bounds: JointBounds) -> _ToolLevers:
-        """Return the levers of the tip of a machine within joint limits."""
+        """Return each joint's largest lever arms on a machine's tool over all configurations within joint limits."""
         robot, parts = machine.robot, RigidParts.of(machine.robot)
         chain = parts.path(parts.of_link[robot.root], parts.of_link[robot.tip_link])[1]
         rotation, translation = parts.pose[robot.tip_link]

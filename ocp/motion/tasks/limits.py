@@ -61,7 +61,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return two opposite corners of the rectangle in which the stability index suffices. Shape (2,) each, m."""
+        """Return opposite corners (2,), m, of the rectangle of zero moment points with sufficient stability index."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 

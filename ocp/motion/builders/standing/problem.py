@@ -257,7 +257,7 @@ def constrain_tips(
     moving: bool,
     level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the poses of their tasks, or to the accelerations and, if `moving`, the start velocities.
+    """Constrain the tips to poses if `level` is "position", else to accelerations and, if `moving`, start velocities.
 
     `motion` has base, joint positions, rates and accelerations.
     """
