@@ -136,7 +136,7 @@ class AccessoryProblem:
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian, as a cost, if states and controls change by characteristic sizes."""
+        """Integrated second-order change of the Hamiltonian if states and controls change by characteristic sizes."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 

@@ -369,7 +369,7 @@ class EndLimits:
         return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the signed multipliers of end and of start constraints, selected from those of all end limits."""
+        """Return the signed multipliers of end and of start constraints, from the multipliers of all K limits."""
         values = np.zeros(sum(self.rows))
         is_row = self.row >= 0
         np.add.at(values, self.row[is_row], (self.sign * multipliers)[is_row])

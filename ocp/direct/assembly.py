@@ -160,7 +160,7 @@ class Transcription:
         return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments p, lbx, ubx, lbg and ubg for given parameters and values of the bound table."""
+        """Return the solver arguments p, lbx, ubx, lbg, ubg from the parameters and the problem's numeric bounds."""
         lower, upper = bounds
         return {
             "p": p,

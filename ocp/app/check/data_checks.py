@@ -89,7 +89,7 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 
 @dataclass(eq=False)
 class _Samples:
-    """Times (M,) and samples (M, k) of joints during their correction, with the joint limits and the faults found."""
+    """Times (M,) and joint samples (M, k) of a file while its faults are corrected, with joint limits and faults."""
 
     t: Array
     q: Array

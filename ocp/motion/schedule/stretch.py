@@ -169,7 +169,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 
 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
-    """Return the least numbers of parts of each interval with which a motion loses only the share `lost` of its time.
+    """Return into how many parts to split each interval so that unused jerk costs about the share `lost` of the time.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
     u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
@@ -206,7 +206,7 @@ class _Samples:
         self.speed, self.rows = self._columns(grid.rows)
 
     def add(self, places: Array) -> NDArray[np.intp]:
-        """Evaluate the limits at distances (M,) along the path; return the indices of these places."""
+        """Append the coefficients at distances (M,) along the path to the table; return their column indices."""
         grid, first = self.grid, len(self.speed)
         speed, rows = self._columns(limit_rows(grid.path, grid.limits, grid.joints, places))
         self.speed, self.rows = np.append(self.speed, speed), np.concatenate([self.rows, rows], axis=2)
@@ -360,7 +360,7 @@ def _solve_with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a `Program` starting from the reduced solution of a similar one; on failure, from one reduced further."""
+    """Solve a `Program` starting from reduced squared speeds of a similar solution; on failure, reduce them further."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -444,7 +444,7 @@ def _spline_rows(
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return the constraints `of` * squared speed <= 1 at given points, each at a fraction of an interval."""
+    """Return the constraints c * squared speed <= 1, with coefficients c = `of`, at given fractions of intervals."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 

@@ -137,10 +137,10 @@ class PathLength(Homogeneous):
     """Cost of a step: the weighted sum of the absolute joint displacements."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Minimise step plus later cost over the ends of P steps, exactly on curves; return bounds, multipliers, ends.
+        """Return lower bounds (P,) of the costs of steps plus later motion, dual multipliers, and step ends (P, r).
 
-        A minimum lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises
-        by 2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
+        Exact on curves: a minimum lies at an end of the chart or where a joint has no displacement. There the slope of
+        the cost, which rises by 2 |w_j T_j| where joint j has no displacement, changes sign (weighted median).
         """
         if target.low.shape[1] != 1:
             return super().minimize(delta, target, after)
@@ -231,7 +231,7 @@ class HomogeneousBounds:
         curvature = np.einsum("pab,pb->pa", self.curve, places)
         return value + (places * (slope + curvature / 2)).sum(axis=1), slope + curvature
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
         return places
 
 

@@ -218,11 +218,11 @@ class TaskSearch:
 
     @property
     def near_cost(self) -> float:
-        """Cost below which a motion counts as close to the bound: twice the relative gap that ends the search."""
+        """Cost below which a motion is close to the bound: its relative gap is twice that which ends the search."""
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return bound, time and joints of the classes of motions that may cost less than `cost`, but have no path."""
+        """Return cost bound, time and joints of the classes of motions with bounds below `cost` but no known path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
@@ -422,7 +422,7 @@ def _angles(rotations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _ToolLevers:
-    """Bounds of the motion of a tool: joint displacements d move its points by at most levers . |d|, and rotate it.
+    """Upper bounds of the motion of a tool: joint displacements d move its points and turn it by at most levers . |d|.
 
     The points are the tip and, at a wrist, the point of the last axis nearest to the axis before, of which fewer joints
     move. The last row is the rotation.
@@ -469,7 +469,7 @@ class _ToolLevers:
         )
 
     def task_distances(self, task: TipTask, times: Array) -> Array:
-        """Return the distances between successive times (M,) on the clock of a task, 0 for what it leaves free."""
+        """Return how far a task moves and turns the tool between successive times (M,) since its start; 0 if free."""
         still = {"base": np.zeros((len(times), 0)), "joints": np.zeros((len(times), self.machine.joint_size))}
         (target,) = targets_along(self.machine, [replace(task, begin=0.0, duration=None)], times, **still)
         placed, turned = len(task.linear) == 3, set(ANGULAR) <= set(task.chosen)

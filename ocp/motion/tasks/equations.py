@@ -333,7 +333,7 @@ class TaskEquations:
 
     @cached_property
     def cone_function(self) -> Any:
-        """CasADi Function from base, joints and targets to `cone_cosines` and their gradients in the joint rates."""
+        """CasADi Function of base, joints, targets: `cone_cosines`, and their time derivatives per unit joint rate."""
         base, joints, targets = self._symbols
         cosines, rates = self.cone_cosines(base, joints, targets), ca.SX.sym("rates", self.machine.joint_size)
         slopes = ca.jacobian(cosines, joints)
