@@ -39,7 +39,7 @@ from ocp.motion.result.candidate import (
 )  # fmt: skip
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
-from ocp.motion.result.solved_plan import Part, SolvedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan, deviation_cost
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -478,6 +478,7 @@ class CandidateSolver(Solver):
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
         request, whole = self.request, self.request.whole or self.request.machine
         extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
+        extended[0] = replace(extended[0], cost=extended[0].cost - deviation_cost(best.solution, parts))
         audits = {} if best.audit is None else {audit_key(): best.audit}
         plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)
         return plan.with_targets(request.tasks)

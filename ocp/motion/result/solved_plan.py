@@ -16,7 +16,7 @@ from models import Machine
 from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES
+from ocp.motion.builders.tool_motion import CLOCK, ERRORS, PACE, SLOPES, START_ERRORS
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
@@ -43,6 +43,20 @@ class Part(NamedTuple):
     suffix: str
 
 
+def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
+    """Return the part of the cost of a solution by which relaxed tasks limit the deviations from their targets."""
+    breaks = solution.control_interpolant.breaks
+    points, weights = np.polynomial.legendre.leggauss(len(solution.control_interpolant.nodes))
+    widths = np.diff(breaks)
+    fractions = breaks[:-1, None] + widths[:, None] * (points + 1) / 2
+    shares = (widths[:, None] * weights / 2).ravel()
+    errors = {part.suffix: part.end - part.begin for part in parts if f"{ERRORS}{part.suffix}" in solution.controls}
+    sample = solution.at_fraction(np.clip(fractions.ravel(), 0.0, 1.0)) if errors else {}
+    total = sum(seconds * shares @ (sample[f"{ERRORS}{suffix}"] ** 2).sum(axis=1) for suffix, seconds in errors.items())
+    starts = (values[-1] for name, values in solution.states.items() if name.startswith(START_ERRORS))
+    return float(total + sum((values**2).sum() for values in starts)) / 2
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class SolvedPlan(Plan):
     """Plan whose motion solves one optimal control problem.
@@ -64,10 +78,10 @@ class SolvedPlan(Plan):
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def cost(self) -> float:
-        """Value of the cost function for the motion."""
-        return self.solution.cost
+        """Value of the cost function for the motion; deviations from relaxed tasks, within tolerance, cost nothing."""
+        return self.solution.cost - deviation_cost(self.solution, self.parts)
 
     @property
     def horizon(self) -> float:
