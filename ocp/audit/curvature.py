@@ -37,7 +37,7 @@ FULL_RANK = RankTolerances(ROUNDING_SHARE, ROUNDING_SHARE)
 
 @dataclass(frozen=True)
 class Curvature:
-    """The second variation of the cost along a plan.
+    """Result of the analysis of the second variation of the cost along a plan.
 
     Attributes:
         least: Smallest curvature of the cost over the feasible variations of a stage, including the optimal response of
@@ -191,7 +191,7 @@ def _sweep(
 
 
 class _Linearised(NamedTuple):
-    """Linearised problem of every stage (mesh interval) as a function of variations of the stage's start and controls.
+    """Linearised problem of all stages (mesh intervals) as a function of variations of their starts and controls.
 
     Attributes:
         whole: Variations of (z, u) at the Gauss points. Shape (N, q, nz + nu, nz + q nu).
@@ -214,7 +214,7 @@ class _Linearised(NamedTuple):
 
     @classmethod
     def of(cls, accessory: AccessoryProblem) -> _Linearised:
-        """Express the variations at all Gauss points by the variations of the interval starts and of the controls."""
+        """Express the variations at the Gauss points by the variations of the interval starts and of the controls."""
         along, nz, nu = accessory.along, accessory.nz, accessory.nu
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
@@ -254,7 +254,7 @@ class _Linearised(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """One stage (mesh interval) of the sweep, reduced to the f control variations that its own constraints leave free.
+    """One stage (mesh interval) of the sweep, reduced to those f control variations that its constraints leave free.
 
     Attributes:
         lift: (z, 1, controls) as a function of (z, 1) and the free variations. Shape (nz + 1 + q nu, nz + 1 + f).
@@ -304,7 +304,7 @@ def _reduce_stages(
 def _eliminate_controls(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate the controls that linear constraints, ``rows`` (K, r, nz + m), determine in K stages of m controls.
+    """Eliminate the controls that linear constraints ``rows`` (K, r, nz + m) determine in K stages of m controls.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -353,7 +353,7 @@ def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale the gradients of end conditions to length 1, so that conditions on states that hardly change count."""
+    """Scale the gradients of end conditions to length 1, so that conditions on almost constant states count as well."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 

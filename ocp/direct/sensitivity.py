@@ -117,7 +117,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
 
 
 def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
-    """Return the formulation, the transcription and the nonlinear program of which a plan is an optimum.
+    """Return the formulation, the transcription and the nonlinear program of which a given plan is an optimum.
 
     Raise ProblemError for any other plan.
     """
@@ -145,7 +145,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differentiate Lagrangian gradient and constraints with respect to k parameters. Shapes (n, k) and (m, k)."""
+    """Differentiate the gradient of the Lagrangian (n, k) and the constraints (m, k) with respect to k parameters."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function

@@ -322,7 +322,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Solve a problem on a mesh, then with nodes at the plan's switches; yield label and plan, or error, of each."""
+    """Solve a problem on a mesh, then with nodes at switching times; yield a label and the plan or error of each."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)

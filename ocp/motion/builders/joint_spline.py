@@ -108,7 +108,7 @@ class PlannedJoints:
         return _Along(*(self.curves(places, order) for order in range(4)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return inertia, drag and rest terms of the joint torques at path distances (M,), m. Shape (M, n) each.
+        """Return coefficients of the joint torques (inertia, drag, rest) at path distances (M,), m. Shape (M, n) each.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -172,7 +172,7 @@ def joint_path(
 
 
 def _knots(s: Array, path: Any) -> Array:
-    """Return the knots of an interpolating spline that is as smooth as the path where its segments meet.
+    """Return the knots of an interpolating spline that is as smooth as the path where path segments meet.
 
     The knots are at the samples (M,), except the samples next to a bound between two segments. Their knots are moved to
     the bound: three for continuous second derivatives, four where the curvature jumps. A bound with fewer samples
@@ -211,7 +211,7 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _sample_places(path: Any, length: float, samples: int) -> Array:
-    """Return at least `samples` distances that are evenly spaced in each segment of a path and resolve all of them."""
+    """Return at least `samples` distances along a path: evenly spaced in each segment, and several in every segment."""
     bounds = np.asarray(getattr(path, "bounds", (0.0, length)), dtype=float)
     shares = (samples - 1) * np.diff(bounds) / length
     counts = np.maximum(np.ceil(shares * (1 - ROUNDING_SHARE)), SPLINE.segment_samples).astype(np.intp)
@@ -220,8 +220,8 @@ def _sample_places(path: Any, length: float, samples: int) -> Array:
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
-    """Return the distances, m, along a path of the targets of a plan at given times; raise ProblemError unless the
-    targets run along the whole path. Shape (M,).
+    """Project the targets of a plan at given times onto a path, and return their distances along the path, m. Raise
+    ProblemError unless the targets run along the whole path. Shape (M,).
     """
 
     def fail(fault: str, at: int, value: float) -> ProblemError:
@@ -352,7 +352,7 @@ class _BatchedFunction:
         self.tables[width].append((table, steps))
 
     def _table(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return a work array with one line per intermediate value, and the function's instructions on its lines."""
+        """Return a work array with one row per intermediate value, and the instructions with rows to operate on."""
         table = np.zeros((self.rows + len(self.constants), width))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)

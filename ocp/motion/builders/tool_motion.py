@@ -97,7 +97,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into intervals in each of which the active tasks do not change; limit pose feedback gains.
+    """Divide the horizon into intervals in which the active tasks do not change, and limit the gains of pose feedback.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -223,7 +223,7 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of a stretch's duration to the horizon, by which the dynamics in it are scaled."""
+        """Return the ratio of a stretch's duration to the horizon, which scales the dynamics in the stretch."""
         return stretch.duration / self.horizon
 
     def declare_states(self, stretch: Stretch) -> tuple[Any, Any]:

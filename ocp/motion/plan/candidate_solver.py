@@ -105,7 +105,7 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks must be relaxed, as their Jacobian is nearly singular along a local motion."""
+        """Return whether the tasks must be relaxed, because their Jacobian is nearly singular on a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
         return self._can_relax and any(sample.is_nearly_singular for sample in samples)
 
@@ -235,7 +235,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """If a candidate passed its audit with a fixed start, return [a copy with a free start], else an empty list."""
+        """Return a candidate whose guess is an audited motion with a fixed start, but whose start is free; else []."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -270,7 +270,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, its first mesh, and a solver set up for guesses that cost about `cost`."""
+        """Return the problem of a candidate, its first mesh, and a solver for guesses with a cost of about `cost`."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
@@ -443,7 +443,7 @@ class CandidateSolver(Solver):
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
-        """Return the number of collision-free configurations at a time, or an error if there are none (cached)."""
+        """Return the number of collision-free configurations at a time, or an error if there are none; cached."""
         if time not in self._clear_counts:
             self._clear_counts[time] = count_clear_configurations(self.request, time)
         return self._clear_counts[time]
@@ -457,7 +457,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes, with details of the lowest-cost candidate that collides."""
+        """Return the error to raise if no candidate passes, with details of the lowest-cost candidate that collides."""
         error = super().failure(candidates)
         colliding = [c for c in candidates if c.reason is not None and c.reason.kind is Rejection.COLLISION]
         if not colliding:
@@ -470,7 +470,7 @@ class CandidateSolver(Solver):
         return error
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, in which the other candidates are listed as well."""
+        """Return the first candidate as a plan, which also lists the other candidates."""
         best = candidates[0]
         parts = tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in self.motion.stretches)
         assert best.solution is not None

@@ -50,8 +50,8 @@ from ocp.motion.search.held_joints import (
     release_obstructing,
     restore_error,
 )
-from ocp.motion.search.search import checked_bound
-from ocp.motion.search.task_search import TaskSearch
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, checked_bound
+from ocp.motion.search.task_search import TaskSearch, tool_rate_bound
 from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
@@ -84,9 +84,14 @@ def plan_from_configurations(
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
         return _final_plan(queue, solver), None
-    if request.search == "global":
+    if request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS:
+        queue.run(candidates_from(solver, motions), include_costlier=True)
+        if queue.passed:
+            return _final_plan(queue, solver), tool_rate_bound(request) or None
+    search = None
+    if request.search == "global" and request.redundancy <= MAX_FREE_DIRECTIONS:
         report("global search")
-    search = TaskSearch(request, motions) if request.search == "global" else None
+        search = TaskSearch(request, motions)
     if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:
@@ -104,7 +109,7 @@ def plan_from_configurations(
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the candidate that costs least by the cost function of the request.
+    """Return the plan of the candidate that costs least in terms of the cost function of the request.
 
     If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
     their costs before. If no motion passed, raise SolveError.
@@ -209,7 +214,7 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
 
 def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
-    """Solve the motions of a global search; return whether a plan costs so little that none of them promises less.
+    """Solve candidates from a global search; return whether one has passed and no other one promises to cost less.
 
     Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
     free start and, at last, with relaxed tasks.
@@ -235,7 +240,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
+    """Solve candidates of a floating-base machine, from a forward search over grid cells and from local motions.
 
     If there are none, raise the error of the `CellSearch`.
     """

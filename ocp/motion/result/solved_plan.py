@@ -36,7 +36,7 @@ TARGET_TIMES = 401
 
 
 class Part(NamedTuple):
-    """Time interval of a plan, s, and the suffix of the state and control names for this interval in the solution."""
+    """Time interval of a plan, s, and the suffix of the names of states and controls in this interval."""
 
     begin: float
     end: float
@@ -105,7 +105,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._evaluate(times, size, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solution once for each time interval (part) of the plan; see `Plan.solved_parts`."""
+        """Return, for each time interval (part) of the plan, the solution, its suffix of names, and the times in it."""
         which = segment_index([*self._begins, np.inf], times)
         return [
             (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)
@@ -118,7 +118,7 @@ class SolvedPlan(Plan):
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the duration of the tasks that has passed; see `Plan.task_share`."""
+        """Return the fraction of the duration of the tasks that has passed at times (M,), s. Shape (M,)."""
         if CLOCK not in self.solution.states:
             return super().task_share(times)
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
@@ -136,7 +136,7 @@ class SolvedPlan(Plan):
     # ---- targets -----------------------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
-        """Return the plan with the target poses of its tasks, sampled at TARGET_TIMES times."""
+        """Return the plan with the target poses of its tasks, sampled at evenly spaced times."""
         return replace(self, targets=self._targets_of(tasks, np.linspace(0.0, self.horizon, TARGET_TIMES)))
 
     def targets_at(self, times: Any) -> tuple[Target, ...]:
@@ -241,7 +241,7 @@ class SolvedPlan(Plan):
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control with respect to the horizon fraction. Shape (M, n)."""
+        """Return the derivative of a state or control with respect to the fraction of the horizon. Shape (M, n)."""
         is_state = name in self.solution.states
         pool = self.solution.states if is_state else self.solution.controls
         interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
@@ -265,7 +265,7 @@ class SolvedPlan(Plan):
         return [part.begin for part in self.parts]
 
     def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a function of a part of the plan and of fractions of the horizon of this part, at times (M,)."""
+        """Evaluate, at times (M,), a function of a part of the plan and of fractions of the horizon of this part."""
         return evaluate_parts(
             self._begins,
             times,
@@ -292,7 +292,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def machines(self) -> tuple[Machine, ...]:
-        """Machine of each phase; the first phase's machine for all phases if the user declared the problem."""
+        """Machine of each phase; if the user declared the problem, the machine of the first phase for all phases."""
         machines = machines_of_phases(self.request)
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 

@@ -105,7 +105,7 @@ class Grid:
 
     @cached_property
     def rows(self) -> Rows:
-        """Coefficients of all limits at all nodes, then just before the nodes where segments meet."""
+        """Coefficients of all limits at all nodes, followed by those just before the nodes where path segments meet."""
         return limit_rows(self.path, self.limits, self.joints, np.concatenate([self.distance, self.before]))
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
@@ -126,7 +126,7 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
-        """Return the grid of the N intervals from a node on, each split into a number of equal parts (N,)."""
+        """Return the grid of N intervals that begin at a node, each split into a given number of equal parts (N,)."""
         last, ends = first + len(parts), np.append(0, np.cumsum(parts))
         s = np.interp(np.arange(ends[-1] + 1), ends, self.distance[first : last + 1])
         own = (self.jumps > first) & (self.jumps <= last)
@@ -279,7 +279,7 @@ def _steady_speeds(begin: Rows, end: Rows, inside: Array, bounds: Array, request
 
 
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
-    """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,).
+    """Return which intervals are too long, because a limit varies too nonlinearly with distance in them. Shape (N,).
 
     `places` contains the limits at the beginning, at a fraction of the length, and at the end of each interval. `top`
     are the fastest steady speeds (N,), m/s.
@@ -298,7 +298,7 @@ def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Arr
 
 
 def acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,).
+    """Return upper bounds of the acceleration in each interval, given the squared speeds at both ends. Shape (N,).
 
     `left` and `right` are the limits at both ends of each interval.
     """
@@ -324,13 +324,13 @@ def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple
 
 
 def limit_slope(values: Array, gain: Array) -> Array:
-    """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
+    """Return the largest values (N,), at most those given, that change between neighbours at most as `gain` does."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
 
 
 def node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller of the values of the two intervals that meet at each node. Shape (N + 1,)."""
+    """Return at each node the smaller of the values of the two intervals that meet there. Shape (N + 1,)."""
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 

@@ -169,7 +169,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 
 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
-    """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
+    """Return the least numbers of parts of each interval with which a motion loses only the share `lost` of its time.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
     u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
@@ -194,7 +194,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 class _Samples:
-    """Limits at an extensible set of places on a path without jerk limits.
+    """Coefficients of the limits, without jerk limits, at points on a path to which more can be added.
 
     Attributes:
         speed: Largest coefficient of the speed in a limit. Shape (P,), s/m.
@@ -271,7 +271,7 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(
     profile: SpeedProfile, samples: _Samples, places: tuple[NDArray[np.intp], ...], requested: Array
 ) -> tuple[Array, Array]:
-    """Return the largest usage of any limit at four places of each interval, (4, N), and anywhere inside it, (N,).
+    """Return the largest ratio of a quantity to its limit at four points of each interval (4, N), and inside it (N,).
 
     The places are the start, the first Gauss point, the middle and the end. Each row is interpolated by a parabola
     through the others; its error at the Gauss point, where the error of a cubic is largest, is added.
@@ -360,7 +360,7 @@ def _solve_with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a `Program` from the scaled-down solution of a similar one; if that fails, from one scaled down further."""
+    """Solve a `Program` starting from the reduced solution of a similar one; on failure, from one reduced further."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -389,7 +389,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest constant jerk that limits permit in the first (side 0) or last interval, next to rest."""
+    """Return the greatest constant jerk that limits permit in the interval at rest, the first (side 0) or last."""
     interval, sign, ratio = -side, 1.0 - 2.0 * side, 0.0
     for s in (0.0, width):
         for rows in (left, right):
@@ -444,7 +444,7 @@ def _spline_rows(
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return constraints `of` times squared speed <= 1 at given points, each a fraction of an interval."""
+    """Return the constraints `of` * squared speed <= 1 at given points, each at a fraction of an interval."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 

@@ -90,7 +90,7 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """States (base and joint positions) that the search reaches at one time.
+    """States of base and joints that the search reaches at one time.
 
     Attributes:
         time: Time, s.
@@ -281,7 +281,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Return the self-motion rates to be tried from each state, in null-space coordinates. Shape (count, C, r)."""
+        """Return self-motion rates to try from each state, as null-space coordinates. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -335,7 +335,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Move states to the poses of the tasks that begin at their time; return the states that reach these poses."""
+        """Move states to the poses of the tasks that begin at this time; return the states that reach them."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -346,7 +346,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return an error which says that no state can be continued, and which joint limit stops most states."""
+        """Return an error that no state can be continued; it names the joint limit that stops most states."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -390,7 +390,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return K motions through given states of L times; `paths` (L, K) holds the indices of the states."""
+        """Return K motions through states at L times; `paths` (L, K) has the index of each state at its time."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -40,7 +40,7 @@ NARROWEST = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Step cost proportional to the length of the step, a norm of the weighted joint displacements.
+    """Step cost that is proportional to the length of the step: a norm of the weighted joint displacements.
 
     By weak duality, any gradient p of the norm, of dual norm at most one, gives the lower bound p . d of the cost of a
     step d. It is linear in the start and in the end of the step, but for the quadratic deviations of the manifolds.
@@ -54,10 +54,10 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def pool(self, values: Array) -> Array:
-        """Sum joint values (n, ..., P) in each term of the norm, which has one joint or, if a maximum, all joints."""
+        """Sum values (n, ..., P) over the joints in each term of the norm: one joint or, for a maximum, all joints."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of the costs of steps and of motions after them, multipliers, and step ends (P, r).
+        """Return lower bounds (P,) of the costs of steps plus later motion, dual multipliers, and step ends (P, r).
 
         Args: As in `minimal_steps`. The least cost of P steps is that of the linear programs
 
@@ -137,7 +137,7 @@ class PathLength(Homogeneous):
     """Cost of a step: the weighted sum of the absolute joint displacements."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return the values of `Homogeneous.minimize`; on curves, the bounds are the exact minima.
+        """Return lower bounds (P,) of the costs of steps plus later motion, exact on curves, multipliers and step ends.
 
         A minimum lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises
         by 2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
@@ -189,7 +189,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of the cost of a step, proportional to its length, and of the motion after the step.
+    """Lower bounds of the cost of a step, which is proportional to the step's length, plus the cost of later motion.
 
     On curves, the multipliers of each start are computed anew, since the cost has kinks. On manifolds of more
     dimensions this would take too long.
@@ -236,7 +236,7 @@ class HomogeneousBounds:
 
 
 def _longest_step(values: list[Array], changes: list[Array]) -> Array:
-    """Return, for P linear programs, the largest fraction, at most 1, of changes that keeps all values positive."""
+    """Return, for P linear programs, the largest fraction, at most 1, of a change that keeps all values positive."""
     shares = np.zeros(values[0].shape[1])
     for value, change in zip(values, changes, strict=True):
         np.maximum(shares, (-change / value).max(axis=0), out=shares)

@@ -202,7 +202,7 @@ def solve_capture(
     method: Collocation = POINTS,
     **options: Any,
 ) -> Solution:
-    """Solve `capture_problem` with its options within its limits everywhere, first on the mesh `method`."""
+    """Solve `capture_problem` so that limits hold between the mesh nodes as well, starting on the mesh `method`."""
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:
         return capture_problem(chaser, capture, clearance_constraints=constraints, **options)
@@ -296,7 +296,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factor that multiplies each joint position as the detumbling starts: 0 for reaction wheels, else 1."""
+        """Mask of the joints of the arm: 1, but 0 for reaction wheels, whose angles start at 0 in the detumbling."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -372,7 +372,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
+        """Return the base configuration at a time: its position follows from uniform motion of the centre of mass.
 
         The dynamics conserve this motion and the norm of the quaternion. Their continuity would be a condition that no
         control influences, and would leave the second-order conditions undetermined.
@@ -387,7 +387,7 @@ class _Capture:
 
 
 def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joint positions, joint velocities and base configuration at the end of the guess of an approach."""
+    """Return joint positions, joint velocities and base configuration at the end of an approach's initial guess."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)

@@ -257,7 +257,7 @@ def constrain_tips(
     moving: bool,
     level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the accelerations of their tasks and, if `moving`, start velocities, or to the poses alone.
+    """Constrain the tips to the poses of their tasks, or to the accelerations and, if `moving`, the start velocities.
 
     `motion` has base, joint positions, rates and accelerations.
     """
@@ -333,7 +333,7 @@ def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost of a sampled motion as in `standing_problem`, without jerks, by the trapezoidal rule."""
+    """Return the cost of `standing_problem`, without jerk terms, for a sampled motion, by the trapezoidal rule."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)

@@ -152,7 +152,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes, as inward normals and offsets, in which the zero moment point is required to be."""
+    """Return the half-planes that must contain the zero moment point, as inward normals and offsets, m."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
