@@ -1,9 +1,9 @@
 """Grids of nodes along a path that are fine enough to resolve how the limits vary along the path.
 
-The bounds between the segments of the path are nodes. Intervals are halved until every limit row at the fastest steady
-speed varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds
-up, so that the jerk can change at the right time. Towards rest, where v ~ s^(2/3), they shrink in proportion to the
-distance.
+The bounds between the segments of the path are nodes. Intervals are halved until every limit row varies almost linearly
+between nodes at the fastest steady speed, or at the fastest speed that a motion can reach there. They also last only a
+fraction of the time in which the acceleration builds up, so that the jerk can change at the right time. Towards rest,
+where v ~ s^(2/3), they shrink in proportion to the distance.
 """
 
 from __future__ import annotations
