@@ -258,6 +258,21 @@ def test_the_time_does_not_depend_on_the_number_of_samples(seed: int, jerk: floa
         assert greatest_usage(plan) <= 1.001
 
 
+@pytest.mark.parametrize("seed", [10, 85])
+def test_samples_closer_than_rounding_resolves_do_not_change_the_time(seed: int) -> None:
+    """Segments of 10 um and less with 2000 samples, whose rounding errors would dominate third derivatives."""
+    path, times = lines_of_all_sizes(seed), []
+    limits = LineLimits(1.0, 20.0, 2000.0, joints=JointLimits(0.5, 10.0, 200.0))
+    for samples in (60, 2000):
+        parts = [np.linspace(*ends, samples, endpoint=False) for ends in pairwise(path.bounds)]
+        s = np.append(np.concatenate(parts), path.length)
+        joints = joint_path(FixedBase(planar_chain([1.0] * 3, [1.0] * 3)), (s, path.at(s).position), path)
+        plan = schedule(path, limits, joints=joints)
+        assert greatest_usage(plan) <= 1.001
+        times.append(plan.duration)
+    assert times[0] == pytest.approx(times[1], rel=1e-3)
+
+
 @pytest.mark.parametrize("seed", [6, 8])
 def test_finer_nodes_between_slow_bends_are_hardly_faster(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a sharp bend the speed grows manifold in a short part of a line, which needs nodes of its own."""
