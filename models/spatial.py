@@ -240,7 +240,7 @@ def force_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Return the solution x of the linear system matrix x = right with a small symmetric positive definite matrix.
+    """Solve the linear system A x = right for x, where A, `matrix`, is small, symmetric and positive definite.
 
     L D L' elimination without pivoting or square roots, meant for n <= 7, with a third of the operations of ca.solve;
     only the lower triangle is read. An indefinite matrix is not detected, and a singular one gives inf or nan.

@@ -140,7 +140,7 @@ class AdaptiveProblem:
             return self._refined(mesh, plan, parameters)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
-        """Refine the mesh by collocation, starting from a plan, and return the plan on the last mesh."""
+        """Solve by collocation on finer and finer meshes, starting from a plan; return the plan on the last mesh."""
         report(f"refining a plan of cost {plan.cost:.6g}")
         settings = RefinementSettings(
             limits={"lost": self.method.accuracy}, max_intervals=self.method.max_intervals, solver=self._how["solver"]

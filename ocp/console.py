@@ -69,7 +69,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the call: set the flag ``stop`` and, if the call does not end, raise KeyboardInterrupt in its thread."""
+        """Stop the public call in this thread: set ``stop`` and, if it does not end, raise KeyboardInterrupt in it."""
         self.stop = True
         began = time.monotonic()
         try:

@@ -313,7 +313,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Scale the contributions so that their maximum, or their mean if they are summed, is ``total``. Shape (N,)."""
+        """Scale the contributions (N,) so that their maximum, or mean if they add up, is their error ``total``."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))

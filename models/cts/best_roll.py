@@ -288,7 +288,7 @@ class Search:
         r encloses.
         """
         target, _ = _inputs(ca.SX)
-        rough, f = self._approximation(target), self._index(target)
+        rough, f = self._rough_roll_function(target), self._index(target)
         points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
         approximate = ca.Function("rough", [target], ca.cse([stack(RoughRoll, points)]))
         first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
@@ -316,7 +316,7 @@ class Search:
             levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
         needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
 
-        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._approximation(target)
+        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._rough_roll_function(target)
         _, cosine, code, _, side = _record(LevelBound, suspect)
         ends = level_points(self.rig, target, cosine)
         points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
@@ -348,7 +348,7 @@ class Search:
         (target, previous, best) -> best.
         """
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-        rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
+        rough, reach = self._rough_roll_function(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
         ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
         near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
@@ -368,8 +368,8 @@ class Search:
         cos4 = float(np.sqrt(2 * sin4)) + sin4
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
-    def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that computes a lower bound of the cost index near an approximate roll angle.
+    def _rough_roll_function(self, target: Expression) -> Callable[..., RoughRoll]:
+        """Return the function from a roll angle (cosine, sine) to its RoughRoll, with a lower bound of the cost nearby.
 
         `about` = (middle, half width) is the range of cos q2 outside of which the bound is inf.
         """
@@ -389,7 +389,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the CasADi Function that refines `count` approximate rolls and compares them with the best roll.
+        """Return the CasADi Function that refines `count` approximate rolls and returns the best of them and of `best`.
 
         (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
         """

@@ -136,7 +136,7 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll angle and a branch.
+    """Joint positions q1, q2, q4 and the point of the goose-neck's corner for a target, a roll angle and a branch.
 
     Attributes:
         corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.

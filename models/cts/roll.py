@@ -214,7 +214,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append a cosine of joint angle 2 to `levels`, marked as relevant only if joint 3 is within limits there."""
+        """Append to `levels` a value of cos q2 where intervals may end; irrelevant if joint 3 is then beyond limits."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -297,7 +297,8 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return the CasADi Function from target and roll angle to cos q2, q1 and cos q4 of the joint positions q.
+    """Return the CasADi Function from target and roll angle to cos q2 and q1 (q: joint positions), whose limits bound
+    the feasible roll angles, and to cos q4, on which the rounding error of cos q2 depends.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll angle. Other functions take the Function as their argument `chart`.
@@ -327,7 +328,7 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return the function of the roll angle that is cos q2 or q1 (joint positions) minus a value, to find its root.
+    """Return a function of the roll angle that is zero where cos q2, or the joint position q1, has a given value.
 
     `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
     derivative.
@@ -387,9 +388,9 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the factor of the squared change of roll in the cost index I2: the rate weight divided by 2 pi.
+    """Check the weight w4 of the squared change of roll in the cost index I2, and return its factor w4 / (2 pi).
 
-    The factor is w4 / (2 pi), equation (37) of the paper.
+    Equation (37) of the paper.
 
     Raises:
         ModelError: The weight w4, `rate_weight`, is negative or not finite.

@@ -73,7 +73,7 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joint positions of least cost index for every target of a table.
+    """Return the joint positions that minimise the cost index I1 or I2 for every target of a table.
 
     A target without a solution does not affect the others.
 

@@ -75,7 +75,7 @@ class Harmonics(NamedTuple):
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return a bound of the polynomial's second derivative in magnitude, hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return hypot(a1, b1) + 4 hypot(a2, b2), which bounds how fast the slope of the polynomial changes."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
@@ -225,7 +225,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the parameter in [-1, 1] at which the pencil of conics in `roots` degenerates to a pair of real lines.
+    """Return the parameter in [-1, 1] at which a combination of the conics that `roots` intersects is two real lines.
 
     The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """

@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason why a pair of links that seems to collide always is not checked, keyed by "A and B" (link names)."""
+        """Reasons why pairs of links that seem to collide permanently are not checked, by "A and B" (link names)."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -318,7 +318,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative velocity of each pair's bodies; raises ModelError for an unlimited prismatic joint."""
+        """Bounds of the pairs' relative velocity per unit joint rate; ModelError for an unlimited prismatic joint."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -370,7 +370,7 @@ class CollisionScene:
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the velocity bounds (`Levers`) of one body relative to the frame of a link, or to the world (-1)."""
+        """Return bounds of a body's velocity per unit rate of joints and base, relative to a link or the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         levers = Levers(np.zeros(size), np.zeros(size), np.zeros(robot.dof), np.zeros(robot.dof))
         if not 0 <= placed.frame < len(self._carriers):

@@ -228,10 +228,9 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Indices of those components of a foot's twist that the joints can change, for each foot but the first.
+        """Indices of the load components, for each foot but the first, along which the joints can move the foot.
 
-        In world axes, they are all six, or three in a plane. The load of a foot has the same rows: nothing resists the
-        others.
+        In world axes, they are all six, or three in a plane. The other components of the load are taken as zero.
 
         Raises:
             ModelError: These rows are always dependent, because the robot's plane is oblique to the axes.

@@ -159,7 +159,7 @@ class Standing(FixedBase):
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the coefficients of condition (18) of Yoo et al. 2004 for a zero moment point at `point`, (2,), m."""
+        """Return the linear equation for the joint accelerations that puts the zero moment point at `point` (2,), m."""
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector("point", point, 2, "x and y on the ground")
         q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")

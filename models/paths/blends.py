@@ -171,14 +171,16 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the shape factors, (V,), of least peak curvature of quintic blends between two lines at given angles."""
-    angles, shape_over_chord = _table()
+    """Return the shape factors, (V,), for which quintic blends between two lines at given angles have the least peak
+    curvature. A shape factor is the length of the end tangents over the distance from vertex to blend ends.
+    """
+    angles, shape_over_chord = _shape_table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[Array, Array]:
-    """Return angles (rad) between two lines, and for each the best shape factor divided by the blend's chord."""
+def _shape_table() -> tuple[Array, Array]:
+    """Tabulate the shape factor of least peak curvature, divided by 2 sin(angle / 2), over the angle between lines."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -344,7 +346,7 @@ def cells(coefficients: Array) -> Cells:
 def parameter(
     coefficients: Array, cells: Cells, index: NDArray[np.intp], distance: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return, for distances (m) from starts of cells (intervals of u), the curve's index and parameter u, (M,) each.
+    """Return curve index and parameter u of points at given arc lengths (m) from the starts of intervals of u (cells).
 
     A cubic Hermite guess from the cell's ends is refined to rounding by Chebyshev iterations.
 
@@ -421,7 +423,7 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the CasADi Function that advances the curve parameter u along a blend by quadrature and Newton steps.
+    """Return the CasADi Function that advances the parameter u of a blend by arc lengths: quadrature and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`; `nodes` is the number of quadrature nodes for each Newton step, the last of which determines

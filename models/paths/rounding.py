@@ -92,10 +92,10 @@ class _Corners(NamedTuple):
         return self._replace(shape=shape)
 
 
-def _remaining_distances(
+def _size_blends(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with best shape factors if `free`, and the distance (m) from each vertex to its blend's ends.
+    """Return the corners, with best shape factors if `free`, and the distances (m) from vertices to blend ends.
 
     Other arguments as for `smooth`.
     """
@@ -365,7 +365,7 @@ def smooth(
     angles = path.corner_angles()
     factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)
     corners = _Corners(path, kind, factors, np.arange(count - 1))
-    corners, distances = _remaining_distances(corners, remaining, deviation, overlap, free)
+    corners, distances = _size_blends(corners, remaining, deviation, overlap, free)
     blends = corners.blends(distances)
     padded = np.concatenate([[0.0], distances, [0.0]])
     rests = path.lengths - padded[:-1] - padded[1:]

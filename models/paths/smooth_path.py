@@ -347,7 +347,7 @@ def path_function(path: SmoothPath) -> Any:
     with the tables of the path in it, which computes the same as `SmoothPath.at`; distances outside the path are
     clamped to it. CasADi differentiates inside a cell only.
     """
-    knots, columns = _cell_table(require.instance("path_function: path", path, SmoothPath))
+    knots, columns = _part_table(require.instance("path_function: path", path, SmoothPath))
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
     outputs = _cell_function()(_column_at(knots, columns, clamped), clamped)
@@ -431,8 +431,8 @@ def _cell_function() -> Any:
     return ca.Function("in_cell", [row, s], ca.cse(outputs))
 
 
-def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the table of a path: distances at which its parts start, then its length, and a data column for each part.
+def _part_table(path: SmoothPath) -> tuple[Array, Array]:
+    """Return the distances at which the parts of a path start, then its length, and a column of each part's geometry.
 
     A part is what remains of a line, arc or helix, or a cell of a curve. A segment has its start point, the axial,
     tangential and inward vectors of its screw, and its rotation rate; a curve its coefficients. Both have distance,

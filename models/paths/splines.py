@@ -98,7 +98,7 @@ class Spline:
 
     @property
     def normal(self) -> Array:
-        """Zero vector, because only curves of constant curvature are computed from their normal. Shape (3,)."""
+        """Zero vector, since points of a spline, unlike those of an arc, are computed without a normal. Shape (3,)."""
         return np.zeros(3)
 
     @cached_property
@@ -161,7 +161,7 @@ class Spline:
 
 
 class SplineTable(NamedTuple):
-    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once."""
+    """Table that locates distances on all splines of a path, to evaluate points of many splines at once."""
 
     curves: Array  # polynomial that each cell is a part of. Shape (C, 6, 3), m.
     cells: Cells  # the cells, each with a curve of its own
@@ -171,7 +171,7 @@ class SplineTable(NamedTuple):
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
-        """Return the table of the splines among a path's segments, given the distances (m) at which segments begin."""
+        """Return the table that locates distances on a path's splines, from its segments and where these begin (m)."""
         splines = [(each, begin) for each, begin in zip(segments, begins, strict=True) if isinstance(each, Spline)]
         counts = [len(each.cells.curve) if isinstance(each, Spline) else 0 for each in segments]
         curves = np.concatenate([np.asarray(each.coefficients)[each.cells.curve] for each, _ in splines])

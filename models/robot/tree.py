@@ -280,7 +280,7 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return a robot's links and joints after replacing or omitting a floating joint, given as the fixed joint `place`.
+    """Return links and joints with `place`, a fixed joint that stands for a floating one, replaced or omitted.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.

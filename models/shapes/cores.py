@@ -230,7 +230,7 @@ def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> E
 def _segment_box_square(
     middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the squared distance of a segment (in the box's axes) from a box, plus a penalty if `weight` > 0.
+    """Return the squared distance of a segment (in the box's axes) from a box, plus `weight` * (offset from middle)^2.
 
     The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
     weight s plus, for each axis, u_k times the excess of x_k over the box, which is zero inside and linear outside. The
@@ -257,7 +257,7 @@ def _segment_box_square(
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return, for each of three components, 1 if its magnitude is the largest relative to its size, else 0."""
+    """Return 1 for that of three components with the largest ratio of magnitude to its entry in `sizes`, else 0."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])

@@ -98,7 +98,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
     points = unit.reshape(-1, 3)
     hull = _hull_vertices(points)
     extreme_points = points[_extreme_indices(points, _principal_axes(points))]
-    grid, box_volume = _grid(points)
+    grid, box_volume = _volume_samples(points)
     parts, capsules = [unit], [_fit_capsule(points)]
     choices: list[tuple[float, list[CoverShape]]] = []
     first_volume = first_overhang = 1.0
@@ -252,13 +252,13 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
     return [side for side in split_triangles(part, axes[k], level) if len(side)]
 
 
-def _grid(points: Array) -> tuple[Array, float]:
-    """Return evenly spread points, (k, 3), in a box around nearly every cover of given points, and the box's volume."""
+def _volume_samples(points: Array) -> tuple[Array, float]:
+    """Return sample points, (k, 3), to estimate volumes of covers of a point set, and the volume of their box."""
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
     shares = (np.arange(1, SETTINGS.grid + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4) + 0.5) % 1
-    wide = 1.5 * np.maximum(high - low, 0.6 * float((high - low).max()))
+    wide = 1.5 * np.maximum(high - low, 0.6 * float((high - low).max()))  # nearly every cover is in the box
     return np.asarray(((low + high) / 2 + (shares - 0.5) * wide) @ frame.T), float(np.prod(wide))
 
 

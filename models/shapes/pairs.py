@@ -256,7 +256,7 @@ class _PairClassifier:
     _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why two bodies need no check, or None, and whether covers of meshes always collide, but hulls do not.
+        """Return why two bodies need no check, or None, and whether hulls of meshes replace covers that always collide.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -343,9 +343,9 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds, m, of the distance at joint vectors (k, dof), and where bounding balls do not suffice.
+        """Return lower bounds, m, of the distance at joint vectors (k, dof), and at which the bounding balls are close.
 
-        Bounding balls suffice where they prove a distance greater than `above`, m.
+        They are close where they do not prove a distance greater than `above`, m. The shapes then give the bound.
         """
         (turn, shift), first, second = self._relative(q), self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius

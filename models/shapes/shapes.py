@@ -166,7 +166,7 @@ class Cylinder(Polytope):
 
     @cached_property
     def hull(self) -> Hull:
-        """The prism by which distances represent the cylinder, in the axes of the cylinder."""
+        """The prism that replaces the cylinder in the computation of distances, in the axes of the cylinder."""
         angles = 2 * pi / SIDES * (np.arange(SIDES) + 0.5)
         around = self.radius / cos(pi / SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
         half = np.full((SIDES, 1), self.length / 2)

@@ -121,7 +121,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Residual gradient of the Hamiltonian, times horizon, in scaled controls; 0 for linear ones. Shape (M, nu)."""
+        """Gradient of horizon times augmented Hamiltonian in scaled controls; 0 if linear in them. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -136,7 +136,7 @@ class AccessoryProblem:
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian, as a cost, if states and controls change by characteristic sizes."""
+        """Integrated second-order change of the Hamiltonian if states and controls change by characteristic sizes."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
@@ -157,7 +157,7 @@ class AccessoryProblem:
 
     @property
     def control_scale(self) -> float:
-        """Second-order change of the cost if every control changes by its own value."""
+        """Second-order change of the cost for variations of the controls that equal the controls themselves."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
@@ -253,10 +253,10 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the Hessian and the active gradients of a plan's end constraints, then those of its start constraints.
+    """Return the Hessian of the Lagrangian and the gradients of active constraints at a plan's end, then at its start.
 
-    They refer to the scaled variations z. Inequalities are active if they have multipliers, state bounds if the plan
-    rests on them.
+    The Lagrangian is the terminal cost plus multipliers times constraints. All refer to the scaled variations z.
+    Inequalities are active if they have multipliers, state bounds if the plan rests on them.
     """
     along, ends = accessory.along, accessory.adjoint.ends
     form, solution, (low, high) = along.form, along.solution, along.bounds

@@ -358,7 +358,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the finding on the largest violation of a constraint, relative to its size or within a `tolerance`."""
+    """Return a finding that compares a constraint's largest violation with `tolerance` or a share of its magnitude."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))

@@ -229,9 +229,9 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return the separation constraints whose state names end with a suffix, each with the motion of its bodies.
+    """Return the separation constraints of one part of a plan, each with the motion of its bodies.
 
-    Those without pairs of bodies are left out.
+    The states of the part have names that end with `suffix`. Constraints without pairs of bodies are left out.
     """
     form = Formulation.of(problem)
     check_variables_match(form, solution)
@@ -369,7 +369,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of distances in K time intervals, m, and the sufficient bounds of all pairs (n,), m.
+        """Return lower bounds of distances, m, in K time intervals, and for n pairs the bounds that end bisection.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.

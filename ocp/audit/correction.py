@@ -210,7 +210,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate errors ``ends`` (N, nx) of the interval ends, and jumps of states ``x``, to later intervals."""
+        """Propagate errors ``ends`` (N, nx) of intervals and jumps of ``x`` between them by the linearised dynamics."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):

@@ -360,16 +360,16 @@ class EndLimits:
 
     @property
     def reach(self) -> np.ndarray:
-        """Change of the cost, per unit multiplier, if states and horizon change by their typical sizes. Shape (K,)."""
+        """Change of each limited quantity if states and horizon change by their typical sizes. Shape (K,)."""
         return np.asarray(np.abs(self.slope) @ self.unit)
 
     @property
     def scaled_slope(self) -> np.ndarray:
-        """Signed gradient of each limit in scaled end state, start state and horizon, over `reach`. Shape (K, .)."""
+        """Gradients of limits towards violation in scaled states and horizon, with 1-norm 1. Shape (K, 2 nx + 1)."""
         return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the signed multipliers of end and of start constraints, selected from those of all end limits."""
+        """Return the signed multipliers of end and of start constraints, from the multipliers of all K limits."""
         values = np.zeros(sum(self.rows))
         is_row = self.row >= 0
         np.add.at(values, self.row[is_row], (self.sign * multipliers)[is_row])

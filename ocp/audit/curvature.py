@@ -165,7 +165,7 @@ def _sweep(
                 if smallest < -FLAT_SHARE * scale:
                     if reason := _singular(accessory, k, worst):
                         return Curvature(least, time, reason, None, t)
-                    return _negative(accessory, sweep, gains, (least, time), first=k, controls=worst)
+                    return _confirmed_negative(accessory, sweep, gains, (least, time), first=k, controls=worst)
                 label = _label(accessory.along.form, worst, nu)
                 flat = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
                 inconclusive, curved = inconclusive or flat, values > FLAT_SHARE * scale
@@ -183,7 +183,7 @@ def _sweep(
         if values[0] / scale < least:
             least, time = float(values[0] / scale), 0.0
         if values[0] < -FLAT_SHARE * scale:
-            return _negative(accessory, sweep, gains, (least, time), start=basis @ vectors[:, 0])
+            return _confirmed_negative(accessory, sweep, gains, (least, time), start=basis @ vectors[:, 0])
         if values[0] <= FLAT_SHARE * scale:
             inconclusive = inconclusive or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT_SHARE * scale, values, 0.0)
@@ -357,7 +357,7 @@ def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
-def _negative(
+def _confirmed_negative(
     accessory: AccessoryProblem,
     sweep: _Linearised,
     gains: list[_Gain],
@@ -367,7 +367,7 @@ def _negative(
     controls: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> Curvature:
-    """Return the result of a sweep with negative curvature, which counts only if an admissible variation confirms it.
+    """Return the result of a backward sweep with negative curvature, undetermined if no admissible variation has it.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.

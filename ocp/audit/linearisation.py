@@ -66,7 +66,7 @@ class Limits:
         return part
 
     def extend(self, count: int) -> None:
-        """Append `count` equality constraints that the plan satisfies exactly."""
+        """Append `count` equality constraints, which the plan satisfies exactly, to these limits."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
@@ -80,7 +80,7 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """For upper, then lower limits: mask of possibly active limits (equalities once), distances, and sign."""
+        """Mask of possible activity, distances, multiplier sign of upper limits and equalities, then of lower ones."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ class Linearisation:
 
     @property
     def may_be_degenerate(self) -> bool:
-        """Whether inequalities may be active. The multipliers of the plan are then not necessarily unique."""
+        """Whether some inequalities may be active, so that the multipliers of the plan need not be unique."""
         sides = (self.control_limits, self.state_limits, self.node_limits)
         return any(bool(limits.near[:, ~limits.equal].any()) for limits in sides)
 
@@ -296,7 +296,7 @@ class Linearisation:
         self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
-        """Add the limits of controls that state equalities imply if differentiated in time until a control appears.
+        """Add to the control limits the equations from state equalities differentiated in time until controls appear.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then

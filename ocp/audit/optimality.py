@@ -402,12 +402,12 @@ def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.nda
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Sum the estimated excess costs over the optimum of all intervals and of the end, for given multipliers."""
+    """Return a plan's estimated excess cost: that of all intervals, plus end multipliers times distances to limits."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the error of multipliers, in units of cost: the implied excess cost plus the errors of their equations."""
+    """Return the excess cost implied by multipliers, plus residuals of costate equation and transversality as costs."""
     assert curved is not None
     loss = _total_loss(_loss_by_interval(along, multipliers, curved), multipliers)
     return loss + multipliers.total + multipliers.ends.transversality

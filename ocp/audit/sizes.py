@@ -300,7 +300,7 @@ def _change_by_variables(
 def row_changes(
     form: Formulation, kind: str, grid: FineGrid, samples: np.ndarray, *, moves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the constraints of one kind at K samples, and their changes with each state or control.
+    """Return the values of one kind of constraint at K samples, and their changes if each state or control changes.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

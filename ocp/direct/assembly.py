@@ -160,7 +160,7 @@ class Transcription:
         return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments p, lbx, ubx, lbg and ubg for given parameters and values of the bound table."""
+        """Return the solver arguments p, lbx, ubx, lbg, ubg from the parameters and the problem's numeric bounds."""
         lower, upper = bounds
         return {
             "p": p,
@@ -293,7 +293,7 @@ class ArrayFunction:
         return buffer, run, inputs, outputs
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Return output columns as arrays and other outputs as sparse matrices; raise RuntimeError on failure."""
+        """Evaluate the function; return columns as arrays, others as sparse matrices; raise RuntimeError on failure."""
         buffer, run, inputs, outputs = self._kept or self._allocate()
         for own, each in zip(inputs, arguments, strict=True):
             own[:] = each.ravel()

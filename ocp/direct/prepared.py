@@ -230,7 +230,9 @@ class Prepared:
         shift: int,
         start: str,
     ) -> Solution:
-        """Solve by Newton's method from a plan, or by the solver from a guess, other points or an elastic plan."""
+        """Solve by Newton's method if the guess is a plan; else, or if it fails, by the solver: from the guess, from
+        alternative initial points, and last from the plan of least constraint violation.
+        """
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)

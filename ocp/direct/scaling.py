@@ -365,7 +365,7 @@ class PredeterminedVariables:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Return a solver's result, marked as infeasible if it violates a limit on predetermined variables.
+        """Return a solver's result, marked infeasible if variables that the initial state determines violate limits.
 
         Args:
             scales: Units in which violations are judged.

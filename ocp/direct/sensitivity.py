@@ -207,9 +207,9 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the controls at the reported times from those of all variables. Shape (M, nu, k).
+    """Return the derivatives of the controls with respect to k parameters, from those of all variables, at M times.
 
-    The controls are linear in the variables, so that differences are exact.
+    Shape (M, nu, k). The controls are linear in the variables, so that differences are exact.
     """
     v, columns = solution.variables, []
     for direction in dv.T:

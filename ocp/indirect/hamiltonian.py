@@ -249,7 +249,7 @@ def nonzero_pattern(matrix: Any, symbols: list[Any]) -> Any:
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper bounds for parameters that are all one, which show the bounds that are finite."""
+    """Return the lower and upper bounds with every parameter set to 1, to know which of the bounds are finite."""
     lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
     return lower, upper
 

@@ -232,7 +232,7 @@ class PrescribedMotion:
                 self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest displacements of the bodies of given pairs by the prescribed motion in time intervals.
+        """Return bounds of how far prescribed motion moves the bodies of given pairs within time intervals.
 
         Args:
             pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).

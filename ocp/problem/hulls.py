@@ -187,9 +187,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of convex shapes whose distances are evaluated for K pairs of bodies, as indices (R,) twice.
+        """Return R pairs of shapes to evaluate: the index of each one's pair of bodies in `pair`, its own in `rows`.
 
-        They are indices into `pair` and into `rows`. The K pairs come first, then the shapes that cover their bodies.
+        The first of them are the K pairs of bodies in `pair`; then come the shapes that cover these bodies.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -319,7 +319,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield each group of hull kinds that occurs in `rows`, and indices of its pairs in `rows` and in the group."""
+        """Yield the groups of the pairs `rows` by kinds of hulls, with their indices in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -433,7 +433,7 @@ class Separation:
 
     @property
     def bodies(self) -> tuple[Hull, ...]:
-        """Hulls of all bodies of the declaration, in the order of their indices."""
+        """Hulls of all bodies of the separation constraint, in the order of their indices."""
         return tuple(self.hulls.values())
 
     @property
@@ -451,7 +451,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Check the pairs of shapes that cover pairs of bodies, and return them by the index of the covered pair."""
+    """Check the pairs of bodies that together contain another pair; return them keyed by the index of that pair."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:

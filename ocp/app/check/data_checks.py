@@ -89,7 +89,7 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 
 @dataclass(eq=False)
 class _Samples:
-    """Times (M,) and samples (M, k) of joints during their correction, with the joint limits and the faults found."""
+    """Times (M,) and joint samples (M, k) of a file while its faults are corrected, with joint limits and faults."""
 
     t: Array
     q: Array
@@ -231,7 +231,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below 1 s that makes sample times plausible ("" if none), and the highest speed if it is 1 s.
+    """Return the unit below 1 s in which times are plausible ("" if none), and the highest speed for times in seconds.
 
     The speed is relative to the joint's limit, or to 1 without one. Times are plausible if the samples are at 10 kHz or
     less, and the fastest joint moves at 1 to 1000 % of its limit.

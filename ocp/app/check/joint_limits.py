@@ -277,7 +277,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least possible maximum of a quantity, and of its negative, in each interval between samples.
+        """Return the least maxima of a quantity and its negative, by interval, over all motions through the samples.
 
         Acceleration: a motion through two samples needs the least acceleration if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h

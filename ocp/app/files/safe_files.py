@@ -205,7 +205,7 @@ class _Container:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append a list value, or the key or value of a mapping entry; `count` is the number of values in it."""
+        """Append an item to the list, or a key or value to the mapping; `count` includes the values nested in it."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):

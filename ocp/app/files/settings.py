@@ -168,7 +168,7 @@ class TomlTable:
         return {name: value for name, value in values.items() if value is not None}
 
     def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
-        """Return `kind` called with entries of the table and other arguments; errors of `kind` name the line."""
+        """Return what the class or function `kind` builds from table entries and arguments; errors state the line."""
         values = self.values(readers) | arguments
         self.done()
         with located_errors(self):

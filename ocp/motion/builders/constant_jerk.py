@@ -313,7 +313,7 @@ def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array,
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest profiles (K,) of the fraction, 0 to 1, that motions have covered of displacements (K, n)."""
+    """Return the fastest profiles of K straight motions over joint displacements (K, n), as fractions of these."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -228,7 +228,7 @@ def roll_problem(
     target = _target_at(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Express a quantity, given in the symbols of target and roll, by the time and the roll of the problem."""
+        """Replace the symbols of target and roll in an expression by the problem's target over time and its roll."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)

@@ -270,8 +270,8 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
-    of least cost; raise SolveError if there is none, or if a plan fails only because of collisions.
+    """Return the first plan on finer and finer meshes that passes its audit, or else the feasible one of least cost;
+    raise SolveError if there is none, or if a plan fails only because of collisions.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin

@@ -375,7 +375,7 @@ class _BatchedFunction:
         try:
             table, steps = self.tables.setdefault(width, []).pop()
         except IndexError:  # first call, or in use by another thread
-            table, steps = self._table(width)
+            table, steps = self._allocate(width)
         np.concatenate([value.T for value in inputs], out=table[self.inputs, :count])
         for operation, places in steps:
             operation(*places)
@@ -384,8 +384,8 @@ class _BatchedFunction:
             result[:] = part.T
         self.tables[width].append((table, steps))
 
-    def _table(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return a work array with one row per intermediate value, and the instructions with rows to operate on."""
+    def _allocate(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
+        """Allocate a work array, a row for each value in the Function; return it and the instructions on its rows."""
         table = np.zeros((self.rows + len(self.constants), width))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)

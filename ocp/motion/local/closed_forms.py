@@ -167,7 +167,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function from a tip pose to candidate angles of first and third loop joint, residuals and conditioning."""
+        """Function from a tip pose to candidate angles of two joints, with residuals and condition of the equations."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -192,8 +192,8 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function from a tip pose and angles of the first and third joint of the loop to two IK solutions of all
-        joints, the excess over their reach, and the lever arm of the second joint.
+        """Function from a tip pose and angles of the first and third joint in the loop closure equation to two IK
+        solutions, the fraction by which the reach of the last three joints is exceeded, and the second's lever arm.
         """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"

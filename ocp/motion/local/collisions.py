@@ -162,7 +162,7 @@ def _relative_pose(frames: Frames, at: NDArray[np.intp], frame: int, observer: i
 
 
 def _fixed_base_frames(scene: CollisionScene, joints: Array) -> Frames:
-    """Return the frames of the bodies, among fixed obstacles, in configurations (M, n) of a machine on a fixed base."""
+    """Return the frames of all bodies at configurations (M, n) of a machine on a fixed base; no obstacle moves."""
     count = len(joints)
     return frames_of(prepared_pairs(scene)[0](np.zeros((count, 0)), joints, np.zeros((count, 1)))[0])
 

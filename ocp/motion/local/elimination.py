@@ -73,7 +73,7 @@ class Axis(NamedTuple):
     revolute: bool = True
 
     def take(self, chosen: NDArray[np.intp]) -> Axis:
-        """Return the axis at the poses with the given indices."""
+        """Return the joint axis at only those of the M poses that have the given indices."""
         return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
@@ -121,11 +121,11 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip, and masks of poses to be confirmed and of incomplete ones.
+        """Return the IK solutions at M poses, and masks of poses where completeness is to be confirmed, or doubtful.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
-        number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
-        confirmed. Such poses are solved with further openings.
+        number of solutions were found. Multiple eigenvalues mix the products of several solutions; completeness is then
+        to be confirmed. Such poses are solved with further openings.
         """
         prescribed, count = self.prescribe(redundant), len(tips.shift)
         even, solutions = bool(self.chain.revolute[self.free].all()), Solutions.none(len(self.chain.axes))
@@ -206,7 +206,7 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Return a loop opened at a joint, with the joints before it last, transformed by the inverse of the goal pose."""
+    """Return the loop opened at a joint: the joints before it come last, transformed by the inverse goal motion."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
@@ -228,8 +228,10 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return coefficients (M, 15, 3, ...) of 1, cos and sin of joint angles in the conformal coordinates of a line
-    element that the joints move. `axes` starts with the joint that moves it first; array axes are in reverse.
+    """Return the coefficients of 1, cos and sin of joint angles in 15 coordinates of a point and direction they move.
+
+    The module's docstring defines the coordinates. Shape (M, 15, 3, ...). `axes` begins with the joint that moves the
+    point first; the array has the axes of the joint angles in reverse order.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))

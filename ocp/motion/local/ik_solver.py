@@ -329,7 +329,7 @@ class ArmSolver:
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
     def _rotations(self, shares: Array) -> Array:
-        """Return the free rotations (S, 3, 3) of the tip for samples in the unit cube: roll, azimuth and cone area."""
+        """Map samples of the unit cube to permitted rotations (S, 3, 3) of the tip: roll, azimuth, tilt in the cone."""
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return rolled
@@ -347,7 +347,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
-    """Return the pose solvers of an arm, if any, and its auxiliary joints; the tip may rotate about `axes` (k, 3)."""
+    """Return the pose solvers of an arm whose tip may rotate about `axes` (k, 3), and the added joints kept at zero."""
     extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
@@ -399,7 +399,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """Solver of all IK configurations of a pose task at a time, for samples of its free parameters."""
+    """Solver of all IK configurations for given targets of a pose task, at samples of the parameters that are free."""
 
     def __init__(self, equations: TaskEquations, arm: ArmSolver) -> None:
         self.arm, self.complete = arm, arm.complete

@@ -369,7 +369,7 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities and pose errors (K, m), and residuals (K,) at time sample k."""
+        """Return Jacobians (K, m, n), task velocities, pose errors (K, m), and the largest errors (K,) at sample k."""
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)

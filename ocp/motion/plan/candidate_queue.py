@@ -181,7 +181,7 @@ class CandidateQueue:
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> list[Candidate] | None:
-        """Return the earlier candidates with the same first solution as a candidate; None if its motion is new."""
+        """Return the group of earlier candidates that were solved to the same motion; None if the motion is new."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(first.seed is candidate.seed for first, *_ in self._motions):
@@ -219,7 +219,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost (and path, if costlier ones are kept) passed its audit before."""
+        """Return whether a candidate of equal cost (and equal path, if costlier motions are included) passed before."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.total - c.total) <= self.settings.same_cost * c.total]
         if not self._always_costlier or candidate.solution is None:
@@ -227,7 +227,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _store_or_push(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store an advanced candidate if it is finished or rejected; else put it back into the queue."""
+        """Store a candidate after one more stage if it is finished or rejected; else put it back into the queue."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED

@@ -295,7 +295,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the start configuration, nan for free joints; joints that move separated bodies are free too."""
+        """Return the start configuration, nan for free joints; those that move bodies to be separated are free."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -430,7 +430,7 @@ class CandidateSolver(Solver):
         return self._collision_reason(collisions[0]) if collisions else None
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
-        """Return the collisions along the local motion of an initial guess, in order of severity."""
+        """Return the collisions along the local (resolved-rate) motion of an initial guess, in order of severity."""
         constraints, collisions = self.request.clearance_constraints, list[Collision]()
         for motion in seed.local if constraints is not None else ():
             assert constraints is not None

@@ -125,7 +125,7 @@ def plan_goal(
 
 
 def has_only_target(goal: Goal) -> bool:
-    """Return whether a goal states only a target: no tasks on the way, and no change of machine or base."""
+    """Return whether a goal is only a target, without tasks, another machine (load) or base pose of its own."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 

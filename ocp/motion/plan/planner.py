@@ -126,7 +126,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates whose guesses are local motions; those that satisfy the tasks come first, sorted by cost.
+    """Return candidates with local (resolved-rate) motions as guesses, those that satisfy the tasks first, by cost.
 
     The cost includes that of the approach from the configuration `near` of the request.
 
@@ -275,7 +275,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve colliding candidates again: with their bodies separated, or with a collision-free start that is fixed.
+    """Solve candidates again: with separation constraints on colliding bodies, or from fixed collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start

@@ -60,7 +60,7 @@ class _Junction(NamedTuple):
 
 
 def _junction_velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity where two motions meet; "rest" if it is zero or, unless `smooth`, may jump there."""
+    """Return the joint velocity to keep where motions meet; "rest" if it is zero or need not be kept (not `smooth`)."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 

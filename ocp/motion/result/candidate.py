@@ -79,7 +79,7 @@ class Reason:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """Return the reason as plain data for a file."""
+        """Return the reason for the rejection as plain data for a file."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
@@ -208,7 +208,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected for `reason` or, if colliding bodies were separated, for their collision."""
+        """Return the candidate as rejected for `reason` or, if a separation was tried, for the collision before it."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)

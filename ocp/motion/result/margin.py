@@ -91,7 +91,7 @@ class Requirements(NamedTuple):
     joint: str = ""
 
     def coefficient(self, uncertainty: str) -> Array:
-        """Return the coefficients of an uncertainty, zero if the requirement does not depend on it. Shape (M,)."""
+        """Return the largest loss of margin per unit of an uncertainty, zero if it has no effect. Shape (M,)."""
         return self.coefficients.get(uncertainty, np.zeros(self.slack.shape))
 
 
@@ -223,7 +223,7 @@ class _Stacked(NamedTuple):
         return Range(float(factors[row]), str(self.labels[row]), float(self.times[row]), row)
 
     def grow(self, weights: Mapping[str, float], stated: list[str]) -> tuple[dict[str, float], list[Range]]:
-        """Return the sizes of uncertainties that are allowed at the same time, and the limits that bound them in turn.
+        """Enlarge all uncertainties until limits stop them; return their sizes, and these limits in the order reached.
 
         All grow in proportion to their weights: first the stated ones, up to their weights if there are others, then
         the others. An uncertainty stops at the first requirement that allows no more of it.
@@ -377,7 +377,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     def add(
         name: str, most: float, value: Array, change: Array, friction: Array | None = None, joint: str = ""
     ) -> None:
-        """Add the inequality value + payload * change + friction uncertainty * friction <= most if `most` is finite."""
+        """Require `value` <= `most`; `change` and `friction` are its growth per unit of payload and friction error."""
         if np.isfinite(most):
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})

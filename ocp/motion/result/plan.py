@@ -173,9 +173,9 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions of the optimal control problems that form the plan, at increasing times (M,), s.
+        """Return the solved optimal control problems of the plan, each with those of the times (M,), s, that lie in it.
 
-        Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
+        Each comes with the suffix of the names of its states and with its times, shape (K,), s; all K add up to
         M. The list is empty for a plan that solves no optimal control problem.
         """
 

@@ -85,7 +85,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def _plans(self) -> tuple[SolvedPlan, ...]:
-        """Plans whose costs, bounds and candidates count for the whole plan."""
+        """Plans of all pieces; their costs and bounds are summed, and their candidates listed together."""
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class ConsecutivePlans(Plan):
         return evaluate_parts([piece.begin for piece in pieces], times, size, values)
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions of the optimal control problems that form the plans, at given times (M,), s."""
+        """Return the solved problems of all plans, each with those of the times (M,), s, that lie in it."""
         pieces = self.pieces
         which = segment_index([*(piece.begin for piece in pieces), np.inf], times)
         parts: list[tuple[Solution, str, Array]] = []

@@ -105,7 +105,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._evaluate(times, size, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return, for each time interval (part) of the plan, the solution, its suffix of names, and the times in it."""
+        """Return for each part its solution, the suffix of variable names, and the given times on its own clock."""
         which = segment_index([*self._begins, np.inf], times)
         return [
             (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)

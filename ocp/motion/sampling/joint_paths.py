@@ -239,7 +239,7 @@ def shorten(motions: StraightMotions, path: Array, scale: Array, *, random: np.r
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array) -> bool:
-    """Return whether two paths are homotopic, as straight motions between equal fractions of them are collision-free.
+    """Return whether two paths count as homotopic: straight motions between equal fractions of them are collision-free.
 
     Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses.
     """

@@ -324,7 +324,7 @@ def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple
 
 
 def limit_slope(values: Array, gain: Array) -> Array:
-    """Return the largest values (N,), at most those given, that change between neighbours at most as `gain` does."""
+    """Lower values (N,) as little as possible so that neighbours differ by at most as much as those of `gain`."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
 

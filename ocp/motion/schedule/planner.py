@@ -394,7 +394,7 @@ def _violated_stretches(
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near both ends of its part of the path, except at path ends."""
+    """Return whether a motion has the requested speed near those of its ends that are not ends of the whole path."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):

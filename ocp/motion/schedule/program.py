@@ -310,7 +310,7 @@ class _Constraints:
 
     def weighted_gradients(self, values: Array) -> Array:
         """Return the sum of the gradients of all constraints, each multiplied by its weight. Shape (N + 2,)."""
-        out = self._spread(self.gradients * values[self.alone :])
+        out = self._accumulate(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
@@ -319,21 +319,21 @@ class _Constraints:
         """Return diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of the gradients."""
         g = self.gradients
         pulled = g * values[self.alone :]
-        main = self._spread(g * pulled)
+        main = self._accumulate(g * pulled)
         main[1:-1] += values[: self.count]
         main[self.bounded] += values[self.count : self.alone]
-        return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
+        return main, self._accumulate([g[0] * pulled[1], g[1] * pulled[2]]), self._accumulate([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
         """Return, for each limit constraint, the three spline coefficients of the interval in which it holds."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints, given spline coefficients and the values of the motion limits."""
+        """Stack the values of all constraints: those on single coefficients `b`, then the motion limits' `rows`."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
-    def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values of limits over each interval; add the k-th sum to the k-th of the interval's three coefficients.
+    def _accumulate(self, values: Iterable[Array]) -> Array:
+        """Sum values of limits by spline coefficient: a limit's k-th value goes to its interval's k-th coefficient.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """

@@ -169,7 +169,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 
 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
-    """Return the least numbers of parts of each interval with which a motion loses only the share `lost` of its time.
+    """Return into how many parts to split each interval so that unused jerk costs about the share `lost` of the time.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
     u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
@@ -206,7 +206,7 @@ class _Samples:
         self.speed, self.rows = self._columns(grid.rows)
 
     def add(self, places: Array) -> NDArray[np.intp]:
-        """Evaluate the limits at distances (M,) along the path; return the indices of these places."""
+        """Append the coefficients at distances (M,) along the path to the table; return their column indices."""
         grid, first = self.grid, len(self.speed)
         speed, rows = self._columns(limit_rows(grid.path, grid.limits, grid.joints, places))
         self.speed, self.rows = np.append(self.speed, speed), np.concatenate([self.rows, rows], axis=2)
@@ -272,11 +272,11 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(
     profile: SpeedProfile, samples: _Samples, places: tuple[Array, tuple[NDArray[np.intp], ...]], requested: Array
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of a quantity to its limit at five points of each interval (5, N), and inside it (N,).
+    """Return the largest ratio to its limit of a quantity except jerk: at five points and over each interval.
 
     The points are the start, the first Gauss point, the middle, the second Gauss point and the end. `places` are the
     distances of the inner ones and the indices of all. Each row is interpolated by a parabola through start, middle and
-    end; its error at the Gauss points, where the error of a cubic is largest, is added.
+    end; its error at the Gauss points, where the error of a cubic is largest, is added. Shapes (5, N) and (N,).
     """
     inside, count = profile.at_distance(places[0].ravel()), len(requested)
     t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
@@ -361,7 +361,7 @@ def _solve_with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a `Program` starting from the reduced solution of a similar one; on failure, from one reduced further."""
+    """Solve a `Program` starting from reduced squared speeds of a similar solution; on failure, reduce them further."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -390,7 +390,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest constant jerk that limits permit in the interval at rest, the first (side 0) or last."""
+    """Return the greatest constant jerk permitted from rest in the first interval (side 0), or to rest in the last."""
     interval, sign, ratio = -side, 1.0 - 2.0 * side, 0.0
     for s in (0.0, width):
         for rows in (left, right):
@@ -445,7 +445,7 @@ def _spline_rows(
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return the constraints `of` * squared speed <= 1 at given points, each at a fraction of an interval."""
+    """Return the constraints c * squared speed <= 1, with coefficients c = `of`, at given fractions of intervals."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 

@@ -143,7 +143,7 @@ class Margins(NamedTuple):
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the usable fractions of the limits, multiplied by one factor for each interval (N,)."""
+        """Return a copy in which the fractions of the limits are multiplied by one factor for each interval (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 
@@ -255,7 +255,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
-    """Return the speed profile of given squared speeds and derivatives at the first nodes of a part of a path."""
+    """Return the speed profile from squared speeds, and their slopes by distance, at the first nodes of a path part."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
@@ -263,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each quantity to its limit in given intervals, and those where limits are enforced.
+    """Return each quantity's largest ratio to its limit in given intervals, and its ratios where limits are enforced.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 

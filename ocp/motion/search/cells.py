@@ -167,7 +167,7 @@ class CellSearch:
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
             for time in np.linspace(stretch.begin, stretch.end, count + 2)[1:-1].tolist():
-                squared_rate = float(kinematics.speed(base, configurations, time).min())
+                squared_rate = float(kinematics.estimate_squared_rates(base, configurations, time).min())
                 total += squared_rate / 2 * stretch.duration / count
         return total
 

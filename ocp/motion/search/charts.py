@@ -404,7 +404,7 @@ class SelfMotionManifolds:
         return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
     def _split_radii(self, charts: Charts, signs: Array) -> Array:
-        """Return the radii that charts at the centres of halves need to cover the part of the manifold of each chart.
+        """Return the radii that charts in the halves of a split chart need to cover its part of the manifold.
 
         Shape (N c,). Their centres are `signs` (c, r) times the radii. At the centre of a half, let the manifold leave
         the chart with slope Ds. A shift u in the chart is then a shift (1 + Ds' Ds)^1/2 u in the half, whose axes are

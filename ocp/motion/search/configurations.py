@@ -174,7 +174,7 @@ class PlanRequest:
 
     @property
     def redundancy(self) -> int:
-        """Largest number of degrees of freedom that the active tasks leave undetermined; that of no task is unknown."""
+        """Largest number of degrees of freedom that the tasks leave undetermined at any time with an active task."""
         sizes = [stretch.equations.size for stretch in self.stretches if stretch.equations is not None]
         return self.machine.joint_size - min(sizes, default=0)
 

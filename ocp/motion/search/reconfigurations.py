@@ -262,7 +262,7 @@ class SectionSearch(AtlasSearch):
     def __init__(
         self, *args: Any, joints: tuple[int, ...], values: Array, radius: float, charts: int, **options: Any
     ) -> None:
-        """Build charts of the self-motion manifolds cut at fixed values of joints, at all time samples.
+        """Build charts, at all time samples, of the sections of the self-motion manifolds with given joints fixed.
 
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds`, of one dimension
@@ -276,7 +276,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return for each time sample the charts of the self-motion manifold's curves on which joints are fixed."""
+        """Return, for each time sample, charts of the curves that remain of the manifold if given joints are fixed."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -297,7 +297,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths over all sections and on single sections, sorted by cost, and the trivial cost bound 0."""
+        """Return paths across sections of the manifolds and within single sections, by rising cost, and the bound 0."""
         count, through_centers = len(self.samples), list[Array]()
         for value in range(len(self._values)):
             restricted = copy(self)

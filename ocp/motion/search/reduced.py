@@ -135,8 +135,8 @@ class ReducedKinematics:
         row_space, null = basis[:, :, : self.rows], basis[:, :, self.rows :]
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
-    def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared norm (K,) of scaled joint rates that perform the tasks far from singularities."""
+    def estimate_squared_rates(self, base: Array, joints: Array, time: float) -> Array:
+        """Estimate the squared norm (K,) of scaled joint rates that perform the tasks; valid far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]

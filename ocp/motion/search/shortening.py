@@ -88,7 +88,7 @@ class PathProblem:
     def through_poses(
         cls, machine: FixedBase, poses: PathPoses, cost: Homogeneous, *, bounds: JointBounds, idle: Array, scene: Any
     ) -> PathProblem:
-        """Return the problem of a path through tool poses.
+        """Return the problem of the lowest-cost joint path on which the tool passes through given poses.
 
         Args:
             machine: The arm.
@@ -119,7 +119,7 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Distinct manifolds, each with the path indices of its time samples and with their rows in the manifolds."""
+        """Sets of manifolds, each with the indices of its samples along the path and the rows of these in the set."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]
@@ -355,8 +355,8 @@ class _LocalProgram:
         if solved:
             self.displacement = (self._basis @ self._solution.x[:size]).reshape(path.shape)
 
-    def _steps(self, k: Indices, joint: Indices, factor: Array) -> Any:
-        """Return the gradients with respect to the path of `factor` times the joint steps after samples `k`."""
+    def _step_gradients(self, k: Indices, joint: Indices, factor: Array) -> Any:
+        """Return gradients, with respect to the path, of `factor` times displacements of `joint` after samples `k`."""
         n, rows = self._path.shape[1], np.arange(len(k))
         entries = np.append(factor, -factor), (np.tile(rows, 2), np.append((k + 1) * n, k * n) + np.tile(joint, 2))
         return scipy.sparse.csr_array(entries, shape=(len(k), self._path.size))
@@ -371,7 +371,7 @@ class _LocalProgram:
         least = np.full(delta.size, -np.inf)
         np.maximum.at(least, groups, value - change)
         chosen = np.flatnonzero((value + change >= least[groups]) & (factor != 0))
-        return _Rows(self._steps(k[chosen], joint[chosen], factor[chosen]), value[chosen]), groups[chosen]
+        return _Rows(self._step_gradients(k[chosen], joint[chosen], factor[chosen]), value[chosen]), groups[chosen]
 
     def _limit_rows(self) -> _Rows:
         """Return linear constraints <= 0 for the joint limits, step limits and clearances that may be violated."""
@@ -385,7 +385,7 @@ class _LocalProgram:
             values.append(excess.ravel()[rows])
             excess = sign * np.diff(path, axis=0) - problem.steps.limits
             k, joint = np.nonzero(excess > -reach)
-            gradients.append(self._steps(k, joint, np.full(len(k), sign)))
+            gradients.append(self._step_gradients(k, joint, np.full(len(k), sign)))
             values.append(excess[k, joint])
         at, distance, gradient = problem.distances(path, self._size)
         entries = -gradient.ravel(), (np.repeat(np.arange(len(at)), n), (at[:, None] * n + np.arange(n)).ravel())

@@ -105,10 +105,10 @@ class StepBounds(Protocol):
     def at(self, places: Array) -> tuple[Array, Array]:
         """Return values (P,) and gradients (P, r) of the cost bounds for steps that start at chart points (P, r)."""
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates t at which bound(t) - slope . t - t . curve . t / 2 is not higher than at t = `places`.
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
+        """Return chart points, by descent from `places`, where the cost bound minus a quadratic function is no higher.
 
-        All arguments have one entry for each step.
+        The function is slope . t + t . curve . t / 2. All arguments have one entry for each step.
         """
 
 
@@ -136,9 +136,9 @@ class StepCost(ABC):
     def quick_bounds(
         self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
     ) -> Array:
-        """Return constants (P,), computed quickly, that are lower bounds of `lower_bounds` in the source charts.
+        """Return constant lower bounds (P,) of the cost of P steps that start in source charts, plus the cost `after`.
 
-        The displacements of the joints differ from `delta` by at most `spans` (P, n).
+        Weaker but quicker than `lower_bounds`. The joint displacements differ from `delta` by at most `spans` (P, n).
         """
         return np.full(len(delta), -np.inf)
 
@@ -307,7 +307,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the bounds over the ends of steps; return steps to the chart centres, minima and minimisers."""
+        """Minimise the cost bounds over end points in the charts; return steps to chart centres, minima, minimisers."""
         start = self.projection - apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
@@ -319,7 +319,7 @@ class SquaredRateBounds:
         slope = products + self.slope - apply_transposed(self.rotation, start + end_place) / self.seconds
         return value + dot(places, products / 2 + self.slope), rows_first(slope)
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
         if places.shape[1] > 2:
             return places
         end_place = self._minimize_after(rows_last(places))[2]

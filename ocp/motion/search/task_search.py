@@ -218,11 +218,11 @@ class TaskSearch:
 
     @property
     def near_cost(self) -> float:
-        """Cost below which a motion counts as close to the bound: twice the relative gap that ends the search."""
+        """Cost below which a motion is close to the bound: its relative gap is twice that which ends the search."""
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return bound, time and joints of the classes of motions that may cost less than `cost`, but have no path."""
+        """Return cost bound, time and joints of the classes of motions with bounds below `cost` but no known path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
@@ -373,7 +373,7 @@ def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, b
     rows = np.flatnonzero(np.isfinite(rates).all(axis=1))  # a joint that costs nothing takes the tool along
     if not rows.size:
         return 0.0
-    limits, count = cost.pool(rates[rows].T), len(rows)
+    limits, count = cost.dual_terms(rates[rows].T), len(rows)
     planes, right = np.vstack([limits, np.eye(count)]), np.append(np.ones(len(limits)), np.zeros(count))
     corners = np.array([*combinations(range(len(planes)), count)])
     corners = corners[np.abs(np.linalg.det(planes[corners])) > 0]
@@ -422,7 +422,7 @@ def _angles(rotations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _ToolLevers:
-    """Bounds of the motion of a tool: joint displacements d move its points by at most levers . |d|, and rotate it.
+    """Upper bounds of the motion of a tool: joint displacements d move its points and turn it by at most levers . |d|.
 
     The points are the tip and, at a wrist, the point of the last axis nearest to the axis before, of which fewer joints
     move. The last row is the rotation.
@@ -440,7 +440,7 @@ class _ToolLevers:
 
     @classmethod
     def of(cls, machine: Machine, bounds: JointBounds) -> _ToolLevers:
-        """Return the levers of the tip of a machine within joint limits."""
+        """Return each joint's largest lever arms on a machine's tool over all configurations within joint limits."""
         robot, parts = machine.robot, RigidParts.of(machine.robot)
         chain = parts.path(parts.of_link[robot.root], parts.of_link[robot.tip_link])[1]
         rotation, translation = parts.pose[robot.tip_link]
@@ -469,7 +469,7 @@ class _ToolLevers:
         )
 
     def task_distances(self, task: TipTask, times: Array) -> Array:
-        """Return the distances between successive times (M,) on the clock of a task, 0 for what it leaves free."""
+        """Return how far a task moves and turns the tool between successive times (M,) since its start; 0 if free."""
         still = {"base": np.zeros((len(times), 0)), "joints": np.zeros((len(times), self.machine.joint_size))}
         (target,) = targets_along(self.machine, [replace(task, begin=0.0, duration=None)], times, **still)
         placed, turned = len(task.linear) == 3, set(ANGULAR) <= set(task.chosen)

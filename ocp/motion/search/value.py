@@ -237,7 +237,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace a cost bound by the constant `floor` if this exceeds the mean of its minimum and central value."""
+        """Replace chart bounds by the constant `floor` where it exceeds the mean of their minimum and central value."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -304,7 +304,7 @@ def _bound_charts(
         remaining, boxes, curvature = steps.select(rows), charts.select(rows), common[rows]
         place = best.minimum(boxes.low, boxes.high)[1]
         for _ in range(settings.refinements):
-            place = remaining.lower(place, tilt[rows], curvature)
+            place = remaining.descend(place, tilt[rows], curvature)
         tangent = _tangent_bounds(place, remaining.at(place), curves[rows], curvature, tilt[rows])
         best, least[rows] = _best_combination(best, least[rows], tangent, boxes)
     least = np.minimum.reduceat(least, starts)
@@ -345,7 +345,7 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return lower bounds of costs minus a common quadratic function, from tangents at given points.
+    """Return quadratic lower bounds that touch the cost bounds at given points, minus a common quadratic function.
 
     The subtracted function is tilt . t + t . common . t / 2.
     """

@@ -104,7 +104,7 @@ def checked_tasks(
         check_start: Whether the pose at the start is checked.
     """
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
-    rows = _rows_by_name(equations)
+    rows = _equation_numbers(equations)
     jacobian = equations.jacobian(b, q)
     if equations.size > len(joints):
         words = f"the task fixes {equations.size} rows {rows} but the machine has only {len(joints)} joints"
@@ -151,7 +151,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
-    return f"the task of rows {_rows_by_name(equations)}" if values[-1] <= 1e-12 * values[0] else None
+    return f"the task of rows {_equation_numbers(equations)}" if values[-1] <= 1e-12 * values[0] else None
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
@@ -181,8 +181,8 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
     return ignorable
 
 
-def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the row numbers by which messages name the task equations: twist components 0..5 if there is one task."""
+def _equation_numbers(equations: TaskEquations) -> list[int]:
+    """Return the numbers of the task equations in messages: a single task's twist components 0 to 5, or row indices."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)

@@ -22,7 +22,7 @@ from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars, rotation_from_quaternion
 from ocp.errors import ProblemError, problem_errors, require
-from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, closing_combinations, cross_product
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, base_independent_combinations, cross_product
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
 
@@ -333,7 +333,7 @@ class TaskEquations:
 
     @cached_property
     def cone_function(self) -> Any:
-        """CasADi Function from base, joints and targets to `cone_cosines` and their gradients in the joint rates."""
+        """CasADi Function of base, joints, targets: `cone_cosines`, and their time derivatives per unit joint rate."""
         base, joints, targets = self._symbols
         cosines, rates = self.cone_cosines(base, joints, targets), ca.SX.sym("rates", self.machine.joint_size)
         slopes = ca.jacobian(cosines, joints)
@@ -393,7 +393,7 @@ class TaskEquations:
             return directions
         if not isinstance(self.machine, FreeFloating):
             return np.zeros((self.size, 0))
-        return directions @ closing_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
+        return directions @ base_independent_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
 
 
 def _whole(task: TipTask, value: Any) -> Any:

@@ -37,7 +37,7 @@ class InFoot:
         require.nonnegative("InFoot: margin", self.margin, unit="m")
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""
+        """Raise ProblemError if the support polygon of a machine is too small for the margin that this rule demands."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -61,7 +61,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return two opposite corners of the rectangle in which the stability index suffices. Shape (2,) each, m."""
+        """Return opposite corners (2,), m, of the rectangle of zero moment points with sufficient stability index."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -159,9 +159,9 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
     return rows[free]
 
 
-def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0: x, 1: y) of the zero moment point that vary, so that a rule's rectangle must bound
-    them; raise ProblemError if a constant coordinate is outside of the rectangle.
+def constrained_axes(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
+    """Return the coordinates (0: x, 1: y) of the zero moment point that are not constant, so that constraints must keep
+    them in the rectangle of `zmp`; raise ProblemError if a constant coordinate is outside of the rectangle.
     """
     rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
     low, high = zmp.region(machine)

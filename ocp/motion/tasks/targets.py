@@ -133,7 +133,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of pose values in the column of targets, and the slice of each pose's velocity."""
+    """Return where the stacked task targets have pose values (indices) and the velocity of each pose (slices)."""
     poses, rates, at = list[int](), list[slice](), 0
     for part in equations.bound:
         for pose, rate in part.target_rows.values():

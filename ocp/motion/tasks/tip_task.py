@@ -428,11 +428,11 @@ def cross_product(a: Any, b: Any) -> Any:
     return ca.mtimes(skew(a), b)
 
 
-def closing_combinations(
+def base_independent_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of selected task equations that are independent of base motion with a fixed centre of
-    mass. Raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return to their start.
+    """Return the linear combinations of selected task equations that do not change if the base moves but the centre of
+    mass does not. Raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return.
     """
     jacobians = []
     for bound in bound_tasks:

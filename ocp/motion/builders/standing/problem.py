@@ -43,8 +43,8 @@ from ocp.motion.tasks.limits import (
     Pinned,
     ZmpRule,
     check_rule,
+    constrained_axes,
     foot_rows,
-    index_rows,
     is_finite,
 )
 from ocp.motion.tasks.tip_task import TipTask
@@ -257,7 +257,7 @@ def constrain_tips(
     moving: bool,
     level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the poses of their tasks, or to the accelerations and, if `moving`, the start velocities.
+    """Constrain the tips to poses if `level` is "position", else to accelerations and, if `moving`, start velocities.
 
     `motion` has base, joint positions, rates and accelerations.
     """
@@ -359,7 +359,7 @@ def _constrain_ground(
     point = center_of_pressure(reaction)
     if isinstance(zmp, IndexAtLeast):
         low, high = zmp.region(machine)
-        rows = index_rows(machine, zmp, point, bool(wrenches))
+        rows = constrained_axes(machine, zmp, point, bool(wrenches))
         problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows], unit="m")
     elif isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
