@@ -135,8 +135,11 @@ class SpeedProfile:
         todo = np.flatnonzero(~even)
         # Newton steps inside a bracket, since distance increases with time
         high = high[todo]
-        whole = integrate_jerk(v[todo], a[todo], j[todo], high)[0]
-        t[todo] = high * np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0) ** np.where(a[todo] == 0, 0.5, 1)
+        whole, last, _ = integrate_jerk(v[todo], a[todo], j[todo], high)
+        share = np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0)
+        # as if the acceleration were constant
+        reached = np.sqrt((1 - share) * v[todo] ** 2 + share * last**2)
+        t[todo] = np.minimum(2 * share * whole / np.maximum(v[todo] + reached, 1e-300), high)
         low = np.zeros_like(high)
         for _ in range(60):  # more than halving a bracket to the last digit takes
             if not todo.size:
