@@ -201,9 +201,9 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
     for finer in (False, True):
         if finer and not (queue.passed and search.refine_samples(everywhere=True)):
             break
-        for include_costlier in (False, True):
-            if _solve_classes(queue, solver, search, include_costlier):
-                return
+        solved = any(_solve_classes(queue, solver, search, costlier) for costlier in (False, True))
+        if queue.cost <= search.near_cost or (finer and solved):
+            return
     if queue.passed:
         for bound, time, joints in search.unresolved(queue.cost):
             words = f"motions near this configuration at {time:.4g} s may cost {bound:.6g}; the search found no path"
