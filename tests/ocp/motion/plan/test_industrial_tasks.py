@@ -207,9 +207,8 @@ def test_a_ur5_follows_a_program_of_2400_chords_at_constant_speed(tmp_path: Path
     """A rosette of 0.9 m at 50 mm/s, within 0.02 mm, in 10 s of the processor from file to file."""
     angle, tolerance, speed = np.linspace(0, 2 * np.pi, 2401), 2e-5, 0.05
     radius = 0.1 + 0.015 * np.cos(5 * angle)
-    points: Array = np.round(
-        np.column_stack([0.45 + radius * np.cos(angle), radius * np.sin(angle), 0 * angle + 0.2]), 6
-    )
+    flat: Any = np.column_stack([0.45 + radius * np.cos(angle), radius * np.sin(angle), np.full(2401, 0.2)])
+    points: Any = np.round(flat, 6)
     moves = [f"G1 X{x:.3f} Y{y:.3f} Z{z:.3f}" for x, y, z in 1000 * points]
     (tmp_path / "rosette.nc").write_text("\n".join(["G21 G90 F3000", "G0 X565 Y0 Z200", *moves]))
 
