@@ -23,8 +23,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models import FreeFloating
+from models import FreeFloating, find_wheels
 from models.checks import Array
+from ocp.console import check_time
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -199,6 +200,8 @@ class _CellPass:
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
+        # the angle of a wheel has no effect
+        self._effective = ~np.isin((robot := request.machine.robot).joint_names, list(find_wheels(robot)))
         self._max_rate, self._cell_size = np.sqrt(2 * max_cost / request.horizon), settings.narrowest
         self._stretch_layers = list[int]()
         self.layers = list[_Layer]()
@@ -222,6 +225,7 @@ class _CellPass:
             shortest = stretch.duration / steps / 2**self._settings.halvings
             task = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
             while remaining:
+                check_time()
                 current = layers[-1]
                 grown, limit_counts = self._expand(kinematics, current, task, remaining[-1], limited=True)
                 if grown is not None:
@@ -256,7 +260,7 @@ class _CellPass:
             rates, violations = limit_rates(rates, task.null[parents], lower, upper, max_rates=max_rates)
             limit_counts.update(map(tuple, violations[violations[:, 0] >= 0].tolist()))
             rates[violations[:, 0] >= 0] = np.nan
-        displacement = np.abs(rates / root).max(axis=1) * step
+        displacement = np.abs(rates / root)[:, self._effective].max(axis=1, initial=0.0) * step
         cost = layer.cost[parents] + step / 2 * (rates**2).sum(axis=1)
         affordable = np.flatnonzero((cost <= self.max_cost) & (displacement <= self._settings.longest))
         if not affordable.size:
@@ -271,7 +275,8 @@ class _CellPass:
             *states, rates, interval=(layer.time, time), tolerance=REACH_TOLERANCE / 10
         )
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
-        finite = np.isfinite(base).all(axis=1) & (np.abs(joints - start_joints).max(axis=1) <= self._settings.longest)
+        displacement = np.abs(joints - start_joints)[:, self._effective].max(axis=1, initial=0.0)
+        finite = np.isfinite(base).all(axis=1) & (displacement <= self._settings.longest)
         expanded = _Layer(time, base, joints, cost, parents)
         expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (error <= REACH_TOLERANCE)))
         expanded = expanded.select(np.flatnonzero(self._valid_states(kinematics, expanded)))
@@ -299,7 +304,7 @@ class _CellPass:
         The cells grow if there are more states than may be kept. Only with `resize`, they also shrink if there are few.
         """
         attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
-        points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
+        points = np.hstack([(joints * self.root)[:, self._effective], attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
         order = np.argsort(cost, kind="stable")
         # without the offset, coordinates of opposite sign would never share a cell
