@@ -51,7 +51,7 @@ from ocp.motion.search.held_joints import (
     restore_error,
 )
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, checked_bound
-from ocp.motion.search.task_search import TaskSearch, tool_rate_bound
+from ocp.motion.search.task_search import TaskSearch, require_poses, tool_rate_bound
 from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
@@ -85,6 +85,7 @@ def plan_from_configurations(
         _search_cells(queue, solver, motions, configurations)
         return _final_plan(queue, solver), None
     if request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS:
+        require_poses(request)
         queue.run(candidates_from(solver, motions), include_costlier=True)
         if queue.passed:
             return _final_plan(queue, solver), tool_rate_bound(request) or None

@@ -96,6 +96,7 @@ class TaskSearch:
         """
         self.request, self._settings = request, settings
         machine, bounds = request.machine, request.bounds
+        require_poses(request)
         if machine.base_size:
             words = "search='global' needs a machine on a fixed base; use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -114,9 +115,6 @@ class TaskSearch:
         for stretch, motion in zip(request.stretches, motions, strict=True):
             if (equations := stretch.equations) is None:
                 continue
-            if not equations.pose_rows.all():
-                words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
-                raise ProblemError(words, name="search", value="global", time=stretch.begin)
             free_directions = machine.joint_size - equations.size
             if free_directions > MAX_FREE_DIRECTIONS:
                 held = f" ({', '.join(request.held)} are held)" if request.held else ""
@@ -279,6 +277,14 @@ class TaskSearch:
         return motions
 
 
+def require_poses(request: PlanRequest) -> None:
+    """Raise ProblemError if a task of a request for a global search prescribes a velocity instead of a pose."""
+    for stretch in request.stretches:
+        if stretch.equations is not None and not stretch.equations.pose_rows.all():
+            words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
+            raise ProblemError(words, name="search", value="global", time=stretch.begin)
+
+
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
@@ -404,9 +410,8 @@ def tool_rate_bound(request: PlanRequest) -> float:
                 tool = _ToolLevers.of(bind(machine, task).bound[0].tip, request.bounds)
                 levers.append(tool.levers)
                 distances.append(tool.task_distances(task, times - task.begin))
-        matrix, right = np.vstack(levers), np.hstack(distances)
-        factor = matrix / np.sqrt(weights)
-        for row, step in zip(right, np.diff(times), strict=True):
+        factor, right = np.vstack(levers) / np.sqrt(weights), np.hstack(distances)
+        for row, step in zip(right, np.diff(times), strict=True) if len(factor) else ():
             target = row / max(row.max(initial=0.0), TOLERANCE)
             dual = scipy.optimize.nnls(np.vstack([factor.T, target]), np.append(np.zeros(len(weights)), 1.0))[0]
             spread = float(((factor.T @ dual) ** 2).sum())

@@ -130,6 +130,12 @@ def test_no_motion_that_does_the_tasks_costs_less(seed: int, kind: str) -> None:
     assert 0.0 <= least <= cost * (1 + 1e-9)
 
 
+def test_tasks_relative_to_a_link_bound_nothing() -> None:
+    machine = random_chain(0)
+    task = TipTask(position=[0.1, 0.0, 0.2], relative_to="a", duration=1.0)
+    assert tool_rate_bound(checked_request(machine, task, None, PlanOptions(search="global"))) == 0.0
+
+
 def test_with_parallel_rails_the_bound_of_motions_in_time_is_exact() -> None:
     """Four rails share the motion in inverse proportion to their weights, and the plan costs what the bound says."""
     names = ("first", "second", "third", "fourth")
