@@ -94,7 +94,8 @@ def refine(
     between the points on every mesh, as the polynomials of a singular arc do, they are held over each interval.
 
     Args:
-        problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
+        problem, parameters, options, guess: As for :func:`ocp.methods.solve`; a plan of the problem on the initial mesh
+            is the first plan.
         method: The method with the initial mesh. Where the problem has a jump or kink in time, give it a node:
             ``method.with_nodes_at(fractions)``.
         tolerance: Largest integration error, relative to the size of each state: over the whole horizon, or summed over
@@ -244,8 +245,15 @@ def _first(
     settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """Solve the problem on the first mesh and audit the plan; raise SolveError on failure or at the time limit."""
-    solution = solve(problem, method, **arguments)
+    """Solve the problem on the first mesh and audit the plan; raise SolveError on failure or at the time limit.
+
+    A guess that is a plan of this problem on this mesh, for the same parameters, is the first plan.
+    """
+    vector, solution = Formulation.of(problem).parameter_vector, arguments["guess"]
+    known = isinstance(solution, Solution) and solution.success and solution.problem is problem
+    known = known and solution.method == method.settings
+    if not (known and np.array_equal(vector(arguments["parameters"]), vector(solution.parameters))):
+        solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings.limits)
     except TimeLimitReached as error:
