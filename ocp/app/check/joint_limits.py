@@ -25,6 +25,7 @@ from models import FixedBase, Robot
 from models.checks import Array, real
 from ocp.errors import ProblemError, require
 from ocp.motion.result.plan import ENDS, describe_ends
+from ocp.motion.tasks.checks import CHECKS
 from ocp.motion.tasks.limits import LIMITED, JointBounds, Limits
 from ocp.tolerances import LIMIT_SHARE
 
@@ -237,7 +238,7 @@ class Motion:
         is at most the change of speed to the next interval, as under any constant acceleration or jerk from rest.
         """
         rates = np.diff(self.q, axis=0) / np.diff(self.t)[:, None] if self.v is None else self.v
-        speeds, tolerated = np.abs(rates[[0, -1]]), LIMIT_SHARE * np.abs(rates).max(initial=0.0)
+        speeds, tolerated = np.abs(rates[[0, -1]]), max(LIMIT_SHARE * np.abs(rates).max(initial=0.0), CHECKS.still)
         if self.v is None and len(rates) > 1:
             tolerated = np.maximum(tolerated, np.abs(rates[[0, -1]] - rates[[1, -2]]))
         return np.where(speeds > tolerated, speeds, 0.0)

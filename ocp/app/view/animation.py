@@ -32,6 +32,7 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 from ocp.solution_data import match_order, unstack
+from ocp.tolerances import ROUNDING_SHARE
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +112,12 @@ def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
     base, joints, rates, base_rates = samples.base, samples.joints, samples.rates, samples.base_rates
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     if robot.tip is not None:
-        rows = range(6) if robot.dof >= 6 else range(3, 6) if robot.dof >= 3 else (3, 4)
-        description = "of the pose" if robot.dof >= 6 else "of the position" if robot.dof >= 3 else "in the plane"
-        twist = machine.tip_twist(b, q, v)
-        sampler = Sampler([b, q, v], [machine.manipulability(b, q, rows), ca.norm_2(twist[3:6])])
-        index, speed = sampler(base, joints, rates)
-        curves.append(Curve("The motion", f"manipulability {description}", "", index[:, 0]))
+        rows, twist = _controlled_rows(machine, base[0]), machine.tip_twist(b, q, v)
+        if rows:
+            index = Sampler([b, q], [machine.manipulability(b, q, rows)])(base, joints)[0][:, 0]
+            description = "of the pose" if min(rows) < 3 else "of the position"
+            curves.append(Curve("The motion", f"manipulability {description}", "", index))
+        (speed,) = Sampler([b, q, v], [ca.norm_2(twist[3:6])])(base, joints, rates)
         curves.append(Curve("The motion", "speed of the tip", "m/s", speed[:, 0]))
     if isinstance(machine, FreeFloating) and base_rates is not None:
         r = ca.SX.sym("r", machine.base_size)
@@ -134,6 +135,23 @@ def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
             curves.append(Curve("Momentum", f"{name}, total", unit, value[:, 0]))
             curves.append(Curve("Momentum", f"{name}, of the joints alone", unit, part[:, 0]))
     return curves
+
+
+def _controlled_rows(machine: Machine, base: Array) -> list[int]:
+    """Return the rows of the tip's twist that the joints control independently: all rows in which they move the tip, or
+    else the linear ones of these; an empty list if the joints are too few for either.
+
+    They are those at a random configuration, at which the rank is that of almost all configurations.
+    """
+    b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
+    jacobian = ca.Function("jacobian", [b, q], [machine.tip_jacobian(b, q)])
+    values = np.array(jacobian(base, np.random.default_rng(0).normal(size=machine.joint_size)))
+    sizes = np.linalg.norm(values, axis=1)
+    moved = np.flatnonzero(sizes > ROUNDING_SHARE * sizes.max()).tolist()
+    for rows in (moved, [row for row in moved if row >= 3]):
+        if rows and np.linalg.matrix_rank(values[rows], ROUNDING_SHARE * sizes.max()) == len(rows):
+            return rows
+    return []
 
 
 def ground_contact(
@@ -263,7 +281,7 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
     details |= _audit_verdict([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
     base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
     samples = MotionSamples(times, sample.joints, sample.rates, sample.accelerations, base, base_rates)
-    return _animation(name, plan.machine, samples, own_curves, **details)
+    return _animation(name, plan.machine, samples, own_curves, bounds=plan.joint_bounds, **details)
 
 
 def animate_solution(
@@ -342,9 +360,18 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
 
 
 def _animation(
-    name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
+    name: str,
+    machine: Machine,
+    samples: MotionSamples,
+    own_curves: Sequence[Curve],
+    *,
+    bounds: JointBounds | None = None,
+    **details: Any,
 ) -> Animation:
-    """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has."""
+    """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has.
+
+    `bounds` are the limits of the joints; those of the robot if None.
+    """
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = scipy.integrate.cumulative_trapezoid((samples.rates**2).sum(axis=1) / 2, t, initial=0.0)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -361,7 +388,7 @@ def _animation(
         inside = [curve for curve in own_curves if curve.group == ZMP_CONSTRAINT]
         footing, more = ground_contact(machine, samples, inside)
         curves += more
-    curves += joint_curves(machine, Limits().bounds(machine), samples)
+    curves += joint_curves(machine, bounds or Limits().bounds(machine), samples)
     curves += _margins([one for one in own_curves if one.group != "Cost"])
     return Animation(name, machine, t, samples.joints, samples.base, tuple(curves), footing=footing, **details)
 

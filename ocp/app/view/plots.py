@@ -25,7 +25,7 @@ from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.result.plan import Plan
 from ocp.motion.schedule.trajectory import JointTrajectory
-from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
@@ -107,7 +107,7 @@ class Picture(Figure):
 
 
 def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
-    """Plot position, velocity and acceleration of every joint over time, with the robot's limits.
+    """Plot position, velocity and acceleration of every joint over time, with the limits of the plan.
 
     Args:
         plan: Plan, drawn in blue.
@@ -127,7 +127,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
     units = [joint.unit for joint in robot.moving_joints]
-    draw_joints(target, motions, Limits().bounds(plan.machine), names=names, units=units)
+    draw_joints(target, motions, plan.joint_bounds, names=names, units=units)
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
     target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
     return target

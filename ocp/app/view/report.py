@@ -184,7 +184,6 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     motion = Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
     verdict = verdict_of(plan, sample, title)
     audit, check = verdict.audit, verdict.check
-    bounds = Limits().bounds(machine)
     base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
@@ -199,7 +198,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, *count),
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
-        draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
+        draw_curves(motion, plan.joint_bounds, names=check.joints, units=units, faults=check.faults),
         (
             ("The audit", tuple(audit_rows(audit))),
             (f"Samples every {period:g} s against the limits", check.limited_rows),

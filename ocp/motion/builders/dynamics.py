@@ -165,16 +165,17 @@ def declare_actuators(
     smoothing, (starts, ends) = actuation.smoothing * horizon, actuation.rests
     start_rows, end_rows = (np.eye(n) if rows is None else np.asarray(rows) for rows in actuation.rest_rows)
     limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": robot.unit("/s")}
-    rates = problem.state(f"velocities{suffix}", n, initial=0.0 if starts else None, **limits)
-    if ends and len(end_rows):
+    first, last = (0.0 if rest and len(rows) == n else None for rest, rows in ((starts, start_rows), (ends, end_rows)))
+    rates = problem.state(f"velocities{suffix}", n, initial=0.0 if starts else None, terminal=last, **limits)
+    if ends and 0 < len(end_rows) < n:
         problem.end(f"rest{suffix}", ca.mtimes(ca.DM(end_rows), rates), 0, 0)
     limits = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
     jerks: Any = ca.DM(0, 1)
     if np.isfinite(bounds.jerk).any() or cost.jerk:
-        second = problem.state(f"accelerations{suffix}", n, **limits)
-        if starts and len(start_rows):
+        second = problem.state(f"accelerations{suffix}", n, initial=first, terminal=last, **limits)
+        if starts and 0 < len(start_rows) < n:
             problem.start(f"start acceleration{suffix}", ca.mtimes(ca.DM(start_rows), second), 0, 0)
-        if ends and len(end_rows):
+        if ends and 0 < len(end_rows) < n:
             problem.end(f"end acceleration{suffix}", ca.mtimes(ca.DM(end_rows), second), 0, 0)
         jerks = problem.control(f"jerks{suffix}", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
         problem.dynamics(second, pace * jerks)

@@ -31,6 +31,7 @@ from ocp.motion.tasks.goals import Cost, Goal
 from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
+from ocp.problem.values import constant
 from ocp.refinement import split
 from ocp.solution import Guess, Solution
 from ocp.switching import WARM_START_OPTIONS, solve_at_switches
@@ -173,6 +174,8 @@ def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 IPOPT = {"max_iter": 300}
+BARRIERS = 0.1, 1e-10
+"""Default initial barrier parameter of IPOPT, and the tolerance at which the barrier parameter ends."""
 LABELS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
 """Regular expression of constraint labels such as "torques[1]", with or without the name of a phase."""
 
@@ -197,6 +200,7 @@ class SolveSettings:
     method: Collocation | None = None  # first mesh; None for that of the planner
     options: Mapping[str, Any] | None = None  # of IPOPT
     tolerances: Mapping[str, float] | None = None  # of the audit by name, see `ocp.audit.audit.audit`
+    cost: float = np.inf  # of the initial guess, see `barrier_options`; infinite if unknown
 
     def __post_init__(self) -> None:
         if self.method is not None:
@@ -208,6 +212,11 @@ class SolveSettings:
         """IPOPT options given by the user, completed by the defaults of the planner."""
         return {**IPOPT, **(self.options or {})}
 
+    def options_from(self, problem: Problem, mesh: Collocation, guess: Guess) -> dict[str, Any]:
+        """Return the IPOPT options for a guess; those that the user gives come before those that suit the guess."""
+        suitable = WARM_START_OPTIONS if isinstance(guess, Solution) else {}
+        return {**barrier_options(problem, mesh, self.cost, suitable), **self.ipopt_options}
+
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:
     """Return an error about the failed check of an audit whose value exceeds its tolerance by the largest factor."""
@@ -216,12 +225,30 @@ def audit_error(audit: Audit, solution: Solution) -> SolveError:
     return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
 
 
+def barrier_options(problem: Problem, mesh: Collocation, cost: float, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of IPOPT with an initial barrier parameter that suits a guess of known, finite cost.
+
+    An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for each
+    limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier alone
+    determines the result: a motion far away from all limits.
+    """
+    limits = [(each.lower, each.upper) for each in problem.declared.states.values()]
+    limits += [(each.lower, each.upper) for each in problem.declared.controls.values()]
+    limits += [(each.lower, each.upper) for each in problem.declared.path.values()]
+    limit_count = 0
+    for low, high in ((constant(low), constant(high)) for low, high in limits):
+        limit_count += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
+    if not np.isfinite(cost) or not limit_count:
+        return dict(options)
+    largest, (default, smallest) = cost / (limit_count * mesh.intervals * mesh.degree), BARRIERS
+    return {**options, "mu_init": max(min(options.get("mu_init", default), largest), smallest)}
+
+
 def within_limits(
     declare: Callable[[ClearanceConstraints | None], Problem],
     clearance_constraints: ClearanceConstraints | None,
     machines: Mapping[str, tuple[Machine, Limits | None]],
     *,
-    breaks: Sequence[float] = (),
     settings: SolveSettings | None = None,
     guess: Guess = None,
 ) -> Solution:
@@ -233,21 +260,20 @@ def within_limits(
     Args:
         declare: Declares the problem under clearance constraints.
         machines: Machine and limits by the name of the phase, "" without phases. Messages take joint names from them.
-        breaks: Fractions of the horizon that get nodes.
         settings, guess: First mesh, solver options and audit tolerances; guess of the first solve.
 
     Raises:
         SolveError: No plan satisfies its limits; the message has the result of each attempt.
     """
     own = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
-    mesh = (own.method or POINTS).with_nodes_at(breaks)
+    mesh = own.method or POINTS
 
     in_collision: Solution | None = None  # the last plan, if only its clearance failed
 
     def solve_problem(problem: Problem, begin: Guess) -> Solution:
         nonlocal in_collision
         try:
-            return _first_within_limits(problem, mesh, own.ipopt_options, own.tolerances, begin)
+            return _first_within_limits(problem, mesh, own, begin)
         except SolveError as error:
             in_collision = error.solution if is_clearance(error.name) else None
             if begin is guess or in_collision is not None:
@@ -263,13 +289,7 @@ def within_limits(
         raise _with_joint_names(error, machines) from error
 
 
-def _first_within_limits(
-    problem: Problem,
-    mesh: Collocation,
-    settings: Mapping[str, Any],
-    tolerances: Mapping[str, float] | None,
-    begin: Guess,
-) -> Solution:
+def _first_within_limits(problem: Problem, mesh: Collocation, settings: SolveSettings, begin: Guess) -> Solution:
     """Return the first plan on finer and finer meshes that passes its audit, or else the feasible one of least cost;
     raise SolveError if there is none, or if a plan fails only because of collisions.
     """
@@ -286,7 +306,7 @@ def _first_within_limits(
                     guess = plan.solution
                     costly.append((mesh, guess))
                 continue
-            audit = plan.audit(tolerances=tolerances)
+            audit = plan.audit(tolerances=settings.tolerances)
             if audit.passed:
                 return plan
             if collision := collision_error(audit, plan):
@@ -305,10 +325,9 @@ def _first_within_limits(
         for plan in [plan for own, plan in costly if own is finest]:
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
-                plan = tighten(
-                    problem, own, tolerance=MESH_SETTINGS.excess, options={**WARM_START_OPTIONS, **settings}, guess=plan
-                )
-                audit = plan.audit(tolerances=tolerances)
+                options = settings.options_from(problem, mesh, plan)
+                plan = tighten(problem, own, tolerance=MESH_SETTINGS.excess, options=options, guess=plan)
+                audit = plan.audit(tolerances=settings.tolerances)
                 tightened += [plan] if audit.feasible else []
                 reasons.append(f"{finest.intervals} intervals, tightened at any cost: {audit.sentence}")
         costly = [each for each in costly if each[0] is not finest]
@@ -320,17 +339,17 @@ def _first_within_limits(
 
 
 def _attempts(
-    problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
+    problem: Problem, mesh: Collocation, settings: SolveSettings, guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
     """Solve a problem on a mesh, then with nodes at switching times; yield a label and the plan or error of each."""
-    warm = {**WARM_START_OPTIONS, **settings}
     try:
-        plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
+        plan = solve(problem, mesh, options=settings.options_from(problem, mesh, guess), guess=guess)
     except SolveError as error:
         yield "", error
         return
+    warm = settings.options_from(problem, mesh, plan)
     yield "", _tighten_limits(problem, mesh, plan, warm)
-    switched = solve_at_switches(problem, mesh, plan, options=settings)
+    switched = solve_at_switches(problem, mesh, plan, options=warm)
     if switched is not plan:
         yield ", with nodes at its switches", _tighten_limits(problem, mesh, switched, warm)
 

@@ -19,11 +19,12 @@ import numpy as np
 from models import Robot
 from models.checks import Array
 from models.machines.machine import hold_joints
+from ocp.direct.discretisation import Collocation
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import Actuation, checked_motors, joint_torques, running_cost, weights_torques
-from ocp.motion.builders.dynamics_plan import within_limits
+from ocp.motion.builders.dynamics_plan import POINTS, SolveSettings, within_limits
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, ToolMotion
 from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.result.plan import CHECKED_TIMES
@@ -36,6 +37,9 @@ from ocp.motion.tasks.speed_profile import ramp_time
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
+
+SAMPLES_PER_INTERVAL = 16
+"""Number of samples of an initial guess in an interval of the mesh: the jerk of the guess is a difference of them."""
 
 
 class _Demand(NamedTuple):
@@ -194,18 +198,21 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
     rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
     ramps = _ramps(request, unlimited, limits, rest_rows)
-    breaks = np.unique(np.concatenate([ramps, *fractions])).tolist()
+    mesh = _first_mesh(request, limits).with_nodes_at(np.unique(np.concatenate([ramps, *fractions])).tolist())
+    cost = unlimited.cost if request.cost is None else cost_of_motion(unlimited, request.cost)
+    is_at_rest = cost <= request.settings.negligible_rate * request.stretches[-1].end
+    settings = SolveSettings(mesh, cost=np.inf if is_at_rest else cost)
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
             actuation = Actuation(request.cost, request.rests, rest_rows)
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
-            _set_guess(motion, unlimited)
+            _set_guess(motion, unlimited, mesh)
             return motion.problem
 
         joints = {"": (request.machine, limits)}
-        return within_limits(declare, request.clearance_constraints, joints, breaks=breaks)
+        return within_limits(declare, request.clearance_constraints, joints, settings=settings)
 
     try:
         solution = solve_from(start)
@@ -220,6 +227,16 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     return solution
 
 
+def _first_mesh(request: PlanRequest, limits: Limits) -> Collocation:
+    """Return the first mesh of a motion, without nodes at certain times.
+
+    If the controls are jerks, and the time is fixed, the tasks constrain states alone. The errors of such equations, of
+    index 2, are damped by a stiffly accurate scheme only (Hairer, Wanner 1996, section VII.4).
+    """
+    jerks = np.isfinite(limits.bounds(request.machine).jerk).any() or (request.cost is not None and request.cost.jerk)
+    return replace(POINTS, scheme="radau") if jerks and request.time_cost is None else POINTS
+
+
 def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
     """Return the times, as fractions of the horizon, of the middles and ends of the fastest velocity ramps between rest
     and the self-motion at the ends of a plan. Limited jerks switch at these times.
@@ -230,7 +247,9 @@ def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_row
     for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
         speeds = np.abs(rows.T @ (rows @ rates[k, [name not in unlimited.held for name in unlimited.names]]))
         share = rests * max(map(ramp_time, speeds.tolist(), *fastest)) / horizon
-        shares += [abs(k - place) for place in (share / 2, share) if RESOLVED_SHARE < place < 0.5]
+        if share > RESOLVED_SHARE:
+            doublings = max(int(np.log2(1.0 / (POINTS.intervals * share))), 0)
+            shares += [abs(k - place) for place in share * 2.0 ** np.arange(-1, doublings + 1) if place < 0.5]
     return np.array(shares)
 
 
@@ -263,17 +282,21 @@ def _add_demand(error: SolveError, demand: Reason | None) -> None:
     error.args = (f"{words}\n{error}",)
 
 
-def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:
+def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> None:
     """Use a motion that ignores actuator limits as the initial guess of the states and controls of a problem."""
-    fractions = np.linspace(0.0, 1.0, CHECKED_TIMES)
+    nodes, places = mesh.fractions, np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
+    fractions = np.append(nodes[:-1, None] + np.diff(nodes)[:, None] * places, 1.0)
     sample = unlimited.solution.at_fraction(fractions)
     pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0
     for stretch, part in zip(motion.stretches, unlimited.parts, strict=True):
+        accelerations = unlimited.accelerations(part, fractions)
+        times = sample[CLOCK][:, 0] if CLOCK in sample else fractions * (part.end - part.begin)
         values_by_name = {
             "base": sample.get(f"base{stretch.suffix}"),
             "joints": sample[f"joints{stretch.suffix}"],
             "velocities": sample[unlimited.rate_name + stretch.suffix] / pace,
-            "accelerations": unlimited.accelerations(part, fractions),
+            "accelerations": accelerations,
+            "jerks": np.gradient(accelerations, times, axis=0),
         }
         named = {name + stretch.suffix: values for name, values in values_by_name.items()}
         for name, values in {**named, CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}.items():

@@ -22,6 +22,7 @@ from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
+from ocp.motion.builders.dynamics_plan import barrier_options
 from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
@@ -47,7 +48,6 @@ from ocp.motion.search.configurations import (
     describe_alternatives,
 )
 from ocp.motion.search.held_joints import all_joints
-from ocp.problem.values import constant
 from ocp.refinement import refine_from, split
 from ocp.solution import Solution
 
@@ -306,24 +306,11 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return solver options; with separation constraints the initial barrier parameter is reduced.
-
-        An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
-        each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
-        alone determines the result: a motion far away from the bodies, in another homotopy class.
-        """
-        declared = motion.problem.declared
-        min_barrier = self.settings.negligible_rate * motion.horizon
-        if not any(name.startswith(APART) for name in declared.path) or not min_barrier < cost < np.inf:
+        """Return solver options, with which separation constraints leave a guess in its homotopy class."""
+        declared, least = motion.problem.declared, self.settings.negligible_rate * motion.horizon
+        if not any(name.startswith(APART) for name in declared.path) or not least < cost < np.inf:
             return dict(options)
-        limits = [(each.lower, each.upper) for each in (*declared.states.values(), *declared.controls.values())]
-        limits += [(each.lower, each.upper) for each in declared.path.values()]
-        limit_count = 0
-        for low, high in ((constant(low), constant(high)) for low, high in limits):
-            limit_count += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
-        max_barrier = cost / (limit_count * mesh.intervals * mesh.degree)
-        default_barrier, min_barrier = self.settings.barriers
-        return {**options, "mu_init": max(min(options.get("mu_init", default_barrier), max_barrier), min_barrier)}
+        return barrier_options(motion.problem, mesh, cost, options)
 
     # ---- meshes ------------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from ocp.motion.result.plan import Plan, read_record, reading_plan, record_array
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.shortening import PathPoses, PathProblem, optimality_of
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.solution import Solution
@@ -99,6 +99,10 @@ class PathPlan(Plan):
         durations = (np.abs(np.diff(self.joints, axis=0)) / rates).max(axis=1, initial=0.0)
         least = max(float(durations.max(initial=0.0)), 1.0) * np.finfo(float).eps ** 0.5  # waypoints may be equal
         return np.concatenate([[0.0], np.cumsum(np.maximum(durations, least))])
+
+    @property
+    def joint_bounds(self) -> JointBounds:
+        return super().joint_bounds.tightened(self.limits.bounds(self.machine))
 
     @property
     def horizon(self) -> float:

@@ -27,6 +27,8 @@ from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times, values_within
 from ocp.motion.result.candidate import Candidate, Rejection, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
+from ocp.motion.tasks.checks import CHECKS
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
@@ -199,7 +201,7 @@ class Plan(ABC):
         """Return an audit with a further finding: how fast the joints move at the start and end of the motion."""
         ends = np.array([0.0, self.horizon])
         speeds = np.abs(self.at(ends)["rates"])
-        speeds[speeds <= LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0)] = 0.0
+        speeds[speeds <= max(LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0), CHECKS.still)] = 0.0
         end, joint = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))
         text = describe_ends(speeds, self.names, [self._unit(k) for k in range(len(self.names))])
         finding = Finding(ENDS, float(speeds[end, joint]), None, float(ends[end]), text or "at rest")
@@ -241,6 +243,11 @@ class Plan(ABC):
     def audits(self) -> tuple[Audit, ...]:
         """Cached audits, in the order in which they were made."""
         return tuple(self._audits.values())
+
+    @property
+    def joint_bounds(self) -> JointBounds:
+        """Limits of all joints during the plan: the tighter ones of the robot's and of those stated to the planner."""
+        return Limits().bounds(self.machine)
 
     def limit_findings(self) -> list[Finding]:
         """Return the audit findings about the joint position and the joint rate that exceed their limits most."""

@@ -20,6 +20,7 @@ from ocp.errors import ProblemError
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
+from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target
 from ocp.solution import Solution
@@ -89,6 +90,11 @@ class ConsecutivePlans(Plan):
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
+
+    @property
+    def joint_bounds(self) -> JointBounds:
+        lower, *upper = zip(*(piece.plan.joint_bounds for piece in self.pieces), strict=True)
+        return JointBounds(np.min(lower, axis=0), *(np.max(limit, axis=0) for limit in upper))
 
     @property
     def cost(self) -> float:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from models import Machine
 from models.checks import Array
+from models.machines.machine import hold_joints
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, ERRORS, PACE, SLOPES, START_ERRORS
@@ -21,6 +22,7 @@ from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
 from ocp.motion.search.held_joints import all_joints
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
@@ -136,6 +138,17 @@ class SolvedPlan(Plan):
         if CLOCK not in self.solution.states:
             return super().task_share(times)
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
+
+    @property
+    def joint_bounds(self) -> JointBounds:
+        own, limits = super().joint_bounds, None if self.request is None else self.request.arguments.get("limits")
+        if not isinstance(limits, Limits):
+            return own
+        stated = limits.bounds(hold_joints(self.machine, self.held) if self.held else self.machine)
+        whole = [np.array(values) for values in own]  # joints that are held have the limits of the robot
+        for values, free in zip(whole, stated, strict=True):
+            values[[name not in self.held for name in self.names]] = free
+        return own.tightened(JointBounds(*whole))
 
     def _audit(self, **settings: Any) -> Audit:
         """Return the audit of the solution, with findings about all joint limits if the user declared the problem.

@@ -49,7 +49,6 @@ class PlannerSettings:
         coarse_degree, fine_degree: Degrees of collocation; the fine one represents a smooth segment to rounding.
         separated_intervals: Number of intervals of a coarse mesh with separation constraints.
         coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that satisfies its tasks.
-        barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
         samples_per_interval: Number of samples in a mesh interval at which collisions and deviations are checked.
         compared_samples: Number of time samples at which two motions are compared.
         same_cost, same_path: Two candidates count as one motion if either difference is smaller: relative; rad or m.
@@ -78,7 +77,6 @@ class PlannerSettings:
     separated_intervals: int = 24
     coarse_options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 60, "tol": 1e-4, "mu_init": 1e-3})
     fine_options: Mapping[str, Any] = field(default_factory=lambda: {"max_iter": 150})
-    barriers: tuple[float, float] = (0.1, 1e-10)
     samples_per_interval: int = 16
     compared_samples: int = 33
     same_cost: float = 1e-5

@@ -224,6 +224,11 @@ class JointBounds(NamedTuple):
     torque: Array
     power: Array
 
+    def tightened(self, other: JointBounds) -> JointBounds:
+        """Return the tighter one of each limit and its counterpart."""
+        upper = (np.minimum(own, limit) for own, limit in zip(self[1:], other[1:], strict=True))
+        return JointBounds(np.maximum(self.lower, other.lower), *upper)
+
 
 @dataclass(frozen=True)
 class Limits:

@@ -197,6 +197,15 @@ def test_few_samples(tmp_path: Path, count: int) -> None:
         assert check.samples == count
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1.77e-10, 1e-7])
+def test_a_single_sample_is_at_rest_whatever_its_velocities_are_rounded_to(tmp_path: Path, rounding: float) -> None:
+    t, q, v, _ = smooth(11)
+    check = checked(tmp_path, URDF, NAMES, t[:1], q[:1], np.full_like(v[:1], rounding))
+    assert check.passed
+    assert "at rest" in {row.note for row in check.rows}
+    assert "starts at" not in check.sentence
+
+
 def test_where_a_file_begins_changes_no_verdict(tmp_path: Path) -> None:
     t, q, v, _ = smooth()
     limits = {"elbow": 0.9}

@@ -36,6 +36,7 @@ from models import (
     link_frames,
     lock_joints,
     mass_matrix,
+    planar_chain,
     rectangle,
     simplify,
     with_load,
@@ -66,6 +67,7 @@ from ocp.app.view.animation import (
     animate_solution,
     animate_trajectory,
     ground_contact,
+    machine_curves,
 )
 from ocp.app.view.appearance import appearance_of, frames_along
 from ocp.app.view.player import PageServer, build_page
@@ -353,6 +355,24 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
     power = (torques * sample.rates).sum(axis=1)
     work = np.sum(np.diff(shown.t) * (power[1:] + power[:-1]) / 2)
     assert work == pytest.approx(values[-1] - values[0], rel=2e-3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_the_manipulability_of_planar_arms_is_that_of_what_they_control(count: int) -> None:
+    """Of one link nothing; of two, l1 l2 |sin q2|; of three the same, since the last one turns the tip about itself."""
+    lengths, t = [0.5, 0.4, 0.3, 0.2][:count], np.linspace(0.0, 1.0, 21)
+    joints = np.column_stack([t - 1.0, 0.4 + t, -0.2 * t, 0.3 + t])[:, :count]
+    samples = MotionSamples(t, joints, np.ones_like(joints), None, np.zeros((21, 0)), None)
+    shown = {
+        curve.name: curve.values for curve in machine_curves(FixedBase(planar_chain(lengths, [1.0] * count)), samples)
+    }
+    indices = {name: values for name, values in shown.items() if "manipulability" in name}
+    assert list(indices) == [[], ["manipulability of the position"], *[["manipulability of the pose"]] * 2][count - 1]
+    if count in (2, 3):
+        (values,) = indices.values()
+        np.testing.assert_allclose(values, 0.2 * np.abs(np.sin(joints[:, 1])), atol=1e-12)
+    for values in indices.values():
+        assert values.min() > 0.01
 
 
 def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, Plan]) -> None:

@@ -30,6 +30,7 @@ from ocp import (
     solve,
 )
 from ocp.app.check.joint_limits import Fault, Motion
+from ocp.app.view.animation import animate_plan
 from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
 from ocp.app.view.report import draw_curves
 from ocp.motion.local.rates import LocalSolution
@@ -115,6 +116,26 @@ def test_near_limits_are_lines_and_far_ones_words_and_both_the_robots() -> None:
             low, high = ax.get_ylim()
             assert all(low < one < high for one in at)
             assert all(not low < one < high for one in far)
+
+
+def test_limits_that_are_stated_are_drawn_where_they_are_tighter_than_the_robots() -> None:
+    """In a figure, in a report and in a page; and again after the plan is read from its file."""
+    stated = Limits(velocity=[0.3, 0.9, 0.5], acceleration=[2.0, np.inf, 4.0])
+    result = plan(arm(), TASK, 1.0, start=motion().at(0.5)["joints"], limits=stated)
+    assert isinstance(result, SolvedPlan)
+    bounds = result.joint_bounds
+    np.testing.assert_array_equal(bounds.velocity, [0.3, 0.6, 0.5])
+    np.testing.assert_array_equal(bounds.acceleration, [2.0, np.inf, 4.0])
+    np.testing.assert_array_equal(bounds.upper, 6.0)
+    words = [" ".join(text.get_text() for text in ax.texts) for ax in result.plot().axes]
+    lines = [[line.get_ydata()[0] for line in curves(ax, LIMIT)] for ax in result.plot().axes]
+    for joint, most in enumerate(bounds.velocity):
+        assert f"{most:g}" in words[3 * joint + 1] or most in lines[3 * joint + 1]
+    assert "2" in words[2] or 2.0 in lines[2]
+    assert not words[5]
+    assert not lines[5]
+    shown = {curve.name: curve.upper for curve in animate_plan(result).curves if curve.group == "Joint velocities"}
+    assert list(shown.values()) == [0.3, 0.6, 0.5]
 
 
 def test_the_compared_motion_is_orange_and_costs_more() -> None:

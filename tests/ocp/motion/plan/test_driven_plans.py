@@ -26,6 +26,7 @@ from models.checks import Array
 from ocp import Limits, Plan, SolveError, TipTask, plan
 from ocp.__main__ import main
 from ocp.app.files import read_waypoints
+from ocp.motion.builders.dynamics_plan import POINTS
 from ocp.motion.plan.actuators import largest_demand
 from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot
@@ -161,16 +162,30 @@ def plan_end(start: Array) -> Array:
     return np.asarray(result.at(result.horizon)["joints"])
 
 
-@pytest.mark.long
-def test_joints_at_rest_have_no_acceleration_if_their_jerk_is_limited() -> None:
-    """An acceleration that jumps at the start or at the end is an unlimited jerk there."""
+@pytest.mark.parametrize("most", [200.0, pytest.param(120.0, marks=pytest.mark.long)])
+def test_joints_at_rest_have_no_acceleration_if_their_jerk_is_limited(most: float) -> None:
+    """An acceleration that jumps at the start or at the end is an unlimited jerk there.
+
+    The fastest ramp from rest to the self-motion takes a hundredth of the horizon: the first mesh resolves it.
+    """
     free = plan(FIXED, smooth_task(FIXED), start=START)
-    result = plan(FIXED, smooth_task(FIXED), start=START, limits=Limits(jerk=200.0))
+    result = plan(FIXED, smooth_task(FIXED), start=START, limits=Limits(jerk=most))
     assert result.audit().passed
     for name in ("velocities", "accelerations"):
         np.testing.assert_allclose(result.solution[name][[0, -1]], 0.0, atol=1e-4)
-    assert np.abs(result.solution["jerks"]).max() <= 200.0 * (1 + 1e-6)
+    assert np.abs(result.solution["jerks"]).max() <= most * (1 + 1e-6)
     assert free.cost <= result.cost < 1.1 * free.cost
+    assert len(result.solution.control_interpolant.breaks) <= 1.5 * POINTS.intervals
+
+
+def test_joints_that_end_without_a_task_rest_at_fixed_values() -> None:
+    """Equations of the end would say the same as values that are fixed there."""
+    result = plan(FIXED, smooth_task(FIXED), start=START, horizon=SECONDS + 1.0, limits=Limits(acceleration=9.0))
+    assert result.audit().passed
+    names = {finding.name for finding in result.audit().findings}
+    assert "end of velocities 2" in names
+    assert not any(name.startswith("rest") for name in names)
+    np.testing.assert_allclose(result.sampled(np.array([result.horizon])).rates, 0.0, atol=1e-9)
 
 
 @pytest.mark.long

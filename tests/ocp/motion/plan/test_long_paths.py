@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from models import FixedBase, example_robot
+from models import FixedBase, example_robot, smooth
+from models import Path as CornerPath
 from models.checks import Array
-from ocp import Plan, TipTask, plan
+from models.paths import fit_splines
+from ocp import Limits, Plan, TipTask, plan
 from ocp.app.files import read_gcode, read_waypoints
+from ocp.motion.result.solved_plan import SolvedPlan
 
 MACHINE = FixedBase(example_robot("six_axis"))
 DOWN = (0, 0, -1)
@@ -44,6 +47,21 @@ def test_a_program_of_thousands_of_chords_is_planned(tmp_path: Path) -> None:
     (tmp_path / "flower.nc").write_text("\n".join(["G21 G90 F1200", "G0 X550 Z200", *lines]))
     (path,) = read_gcode(tmp_path / "flower.nc").smooth(DEVIATION)
     check(plan(MACHINE, TipTask.along(path, SPEED, steady=True, direction=DOWN), search="start"), points)
+
+
+def test_limits_that_a_long_path_leaves_inactive_take_few_iterations() -> None:
+    """The motion without limits of accelerations and jerks is the guess of the one within them, and stays it."""
+    path = fit_splines(CornerPath.through(rosette(2400, 0.01)[:400]), DEVIATION)
+    task = TipTask.along(smooth(path.path, deviation=path.deviation), SPEED, direction=DOWN)
+    free = plan(MACHINE, task, search="start")
+    result = plan(MACHINE, task, search="start", limits=Limits(acceleration=8.0, jerk=100.0))
+    assert result.audit().passed
+    assert isinstance(result, SolvedPlan)
+    assert result.solution.iterations <= 15
+    assert result.cost == pytest.approx(free.cost, rel=1e-3)
+    sample = result.sample(0.01)
+    assert np.abs(sample.accelerations).max() <= 8.0
+    np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
 
 
 @pytest.mark.long
