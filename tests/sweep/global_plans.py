@@ -41,8 +41,9 @@ RANDOM_GAPS = {False: 0.02, True: 0.08}
 """Largest relative gap for random planar arms, by whether they have two redundant degrees of freedom."""
 EXCESS = 0.005
 """Largest relative excess of a global plan's cost over the best of the solves from random starts."""
-MESH, TRACKING_STEPS, DAMPING = Collocation(12, 3), 40, 0.01
-"""Mesh of the solves from random starts; steps and relative damping of the local motions that are their guesses."""
+MESH, MAX_ITERATIONS, TRACKING_STEPS, DAMPING = Collocation(12, 3), 150, 40, 0.01
+"""Mesh and iterations of the solves from random starts; steps and relative damping of the local motions that are their
+guesses."""
 DISTINCT = 1e-4
 """Relative difference from which two costs belong to different local optima."""
 CHECKED_COUNT = 5
@@ -151,7 +152,8 @@ def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
         lower=machine.robot.lower,
         upper=machine.robot.upper,
     )
-    prepared, optima = prepare(plan_problem(machine, task, scene=False), MESH), list[tuple[float, Array]]()
+    problem, optima = plan_problem(machine, task, scene=False), list[tuple[float, Array]]()
+    prepared = prepare(problem, MESH, options={"max_iter": MAX_ITERATIONS})
     for k in range(starts):
         guess = {"joints": Samples(times, motion.joints[k]), "rates": Samples(times, motion.rates[k])}
         solution = prepared.solve(guess=guess, check=False)
