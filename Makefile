@@ -62,7 +62,7 @@ crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes, check for coll
 brute: $(VENV)/test.stamp ## compare 1000 global searches with all sequences of configurations on a fine grid (ARGS="--again": repeat old results)
 	$(BIN)/python -W ignore -m tests.sweep.brute_force --out "$(OUT)/sweeps/brute_force.jsonl" $(ARGS)
 
-global: $(VENV)/test.stamp ## compare plans of search="global" with plans from 200 random starts each (ARGS="--only panda")
+global: $(VENV)/test.stamp ## compare 300 plans of search="global" with solves from 200 random starts each, and 1000 with their bounds (ARGS="--only panda")
 	$(BIN)/python -W ignore -m tests.sweep.global_plans --out "$(OUT)/sweeps/global_plans.jsonl" $(ARGS)
 
 redundancy: $(VENV)/test.stamp ## plan and check six problems of a published benchmark of redundant arms (ARGS="--only panda__1cube")

@@ -37,7 +37,7 @@ _Kind = TypeVar("_Kind")
 
 
 def check_entries(value: Any) -> None:
-    """Raise ValueError if an array or nested list has more than `INPUT_LIMITS.array_entries` entries.
+    """Raise ValueError if an array or nested list has more entries than the limit `INPUT_LIMITS.array_entries`.
 
     The size is estimated before anything is copied; the first entry of a list stands for all its entries.
     """
@@ -56,7 +56,7 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return numbers, an array or a nested list as a float array; raise an error from NOT_NUMBERS for other values.
+    """Return numbers, an array or a nested list as a float array; raise TypeError or a similar error for other values.
 
     Values that NumPy would convert are refused too: text, True, None, symbols (read as nan) and complex numbers.
     """
@@ -89,12 +89,12 @@ def freeze(array: Array) -> Array:
 
 
 def set_fields(instance: Any, **values: Any) -> None:
-    """Set fields of a frozen dataclass during its construction."""
+    """Set fields of an instance of a frozen dataclass while the instance is constructed."""
     vars(instance).update(values)
 
 
 def argument_of(label: str) -> str:
-    """Return the name of the argument with which a label ends, such as `scheme` for `Collocation: scheme`."""
+    """Return the name of the argument at the end of an error label: `scheme` for the label `Collocation: scheme`."""
     return label.rpartition(" ")[2].strip("'")
 
 
@@ -110,13 +110,13 @@ class Checks:
     error: type[DetailedError]  # class of the exceptions
 
     def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
-        """Return the exception about an argument that violates a requirement, with label, requirement and value."""
+        """Return the exception that reports an argument's label and value and the requirement that it violates."""
         value = value.item() if isinstance(value, np.generic) else value
         words = f"{label} must be {requirement}, not {value!r}"
         return self.error(words, name=argument_of(label), value=value, limit=limit)
 
     def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
-        """Return the exception about an unknown name; its message lists known names, similar ones if there are any."""
+        """Return the exception about an unknown name; its message suggests similar names or lists the known names."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
         similar = [by_case[item] for item in similar_names(str(name).casefold(), by_case, 3)]
@@ -254,7 +254,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return an array of `count` numbers, given one for each item or one number for all. Shape (count,).
+        """Return an array of `count` numbers from one number for each item or one number for all. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -278,7 +278,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a rotation matrix, (3, 3), after checking that it is one and removing rounding errors."""
+        """Return a matrix, (3, 3), after checking that it is a rotation matrix and removing its rounding errors."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -317,7 +317,7 @@ def _unit_text(unit: str) -> str:
 
 
 def _description(array: Array, wrong: Any) -> str:
-    """Return the text by which a message shows an invalid array: the whole array, or its first invalid entry or row."""
+    """Return the text that an error message shows for an invalid array: all of it or its first invalid entry or row."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -328,7 +328,7 @@ def _description(array: Array, wrong: Any) -> str:
 
 
 def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
-    """Warn with ModelWarning if an angle (rad) exceeds two turns; values above 1e4 stand for "no limit".
+    """Warn with ModelWarning if an angle (rad) exceeds two turns; an angle above 1e4 means "no limit" and is accepted.
 
     `label` is as in `Checks`; `name` is that of the warning, the last word of the label if None.
     """
@@ -337,7 +337,7 @@ def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> 
 
 
 def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None) -> None:
-    """Warn if a length (m) exceeds 50 m, since it may be in millimetres; arguments are those of `warn_of_degrees`."""
+    """Warn if a length (m) exceeds 50 m and may be in millimetres; `warn_of_degrees` explains the arguments."""
     _warn_of_unit(label, lengths, name, (50.0, inf), "m is long for a robot; lengths are in m, is it in millimetres?")
 
 
@@ -352,7 +352,7 @@ def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tupl
 
 
 def similar_names(name: str, known: Iterable[str], most: int = 2) -> list[str]:
-    """Return known names that a name abbreviates or lengthens, or else those of similar spelling, the nearest first."""
+    """Return the known names that shorten or extend a given name or, if there are none, names of similar spelling."""
     names = list(dict.fromkeys(known))
     related = [each for each in names if min(len(each), len(name)) > 2 and each[: len(name)] == name[: len(each)]]
     return related[:most] or get_close_matches(name, names, most, 0.5)

@@ -23,7 +23,7 @@ class DetailedError(Exception):
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
     def __reduce__(self) -> Any:
-        """Return the data from which pickle recreates the exception; fields without a pickle become their `repr`."""
+        """Return the data from which pickle recreates the exception; a field that pickle rejects becomes its `repr`."""
         return type(self), self.args, {key: _picklable(value) for key, value in self.__dict__.items()}
 
 

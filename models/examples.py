@@ -60,7 +60,7 @@ def standing_example() -> Standing:
 
 
 def reference_rig(**limits: Any) -> Rig:
-    """Return the captive trajectory rig of the reproduced results, with assumed link lengths.
+    """Return the captive trajectory rig of Lee and Lee (2017), with link lengths that are assumed.
 
     Assumed: 20, 20, 4, 30, 20, 10 in, in the order of the fields of Rig. Keywords are the joint limits of Rig.
     """
@@ -68,7 +68,7 @@ def reference_rig(**limits: Any) -> Rig:
 
 
 def reference_tunnel() -> Tunnel:
-    """Return the wind tunnel, with its cost weights, in which `reference_rig` moves in the reproduced results.
+    """Return the wind tunnel of Lee and Lee (2017), with geometry and weights of the cost that are assumed.
 
     Assumed: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1.
     """

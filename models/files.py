@@ -65,7 +65,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: it is not regular, is too large, or other users own or may change it."""
+    """Error about a file that is refused: it is not regular, is too large, or other users own or may change it."""
 
     value: int | None = None  # size of a file that is too large, bytes; else None
     limit: int | None = None  # largest size that is read, bytes; else None
@@ -160,7 +160,7 @@ def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTre
 
 
 def _parse_bound(data: str | bytes, unbound: list[str], refusal: ElementTree.ParseError) -> ElementTree.Element:
-    """Return the root of an XML document without elements and attributes whose namespace prefix is undeclared.
+    """Return the root of an XML document after removing elements and attributes with undeclared namespace prefixes.
 
     The parser ignores namespaces; names are resolved here as the standard library's parser does.
 
@@ -223,7 +223,7 @@ UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key, a SHA-256 digest, of a result that a code version computes from arrays and strings."""
+    """Return a SHA-256 digest of a code version, arrays and strings as the key under which their result is cached."""
     digest = hashlib.sha256(version.encode())
     for content in contents:
         data = np.frombuffer(content.encode(), np.uint8) if isinstance(content, str) else np.ascontiguousarray(content)
@@ -305,7 +305,7 @@ def cache_files() -> list[Path]:
 
 
 def load_value(key: str) -> Any:
-    """Return the JSON value that the disk cache holds under a key, or None if the value is missing or damaged."""
+    """Return the JSON value that the disk cache stores under a key, or None if the value is missing or damaged."""
     try:
         digest, _, content = read_regular(private_folder() / f"{key}.json", MAX_VALUE_BYTES, own=True).partition(b"\n")
         return json.loads(content) if digest == _digest(key, content) else None
@@ -325,7 +325,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def load_library(key: str) -> Path | None:
-    """Return the path of the shared library that the disk cache holds under a key, or None; mark the library as used.
+    """Return the path of the shared library that the disk cache stores under a key, or None; mark the library as used.
 
     Damaged libraries are removed; those that another user owns or may write are ignored.
     """

@@ -34,7 +34,7 @@ _Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
 
 class Frame(NamedTuple):
-    """Pose of a frame B in a frame A: x_in_a = rotation x_in_b + position.
+    """Pose of a frame B in a frame A, which transforms points as x_in_a = rotation x_in_b + position.
 
     Attributes:
         rotation: Axes of B as columns, in A. Shape (3, 3).
@@ -84,7 +84,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Decorate a function of CasADi matrices: for MX arguments, build it with SX symbols and call it as a Function.
+    """Decorate a function of CasADi matrices: for MX arguments, build a Function with SX symbols and call that.
 
     Element-wise MX graphs are slow to build and to run. Other arguments pass through unchanged. A flat list of scalars
     with MX entries counts as an MX column.
@@ -140,7 +140,7 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
 
 
 def rotation_matrices(vectors: Array) -> Array:
-    """Return the matrices of rotations about given vectors by their lengths, rad. Shapes (..., 3) to (..., 3, 3)."""
+    """Return the rotation matrices of rotation vectors (rad). Shapes (..., 3) -> (..., 3, 3)."""
     angles = np.linalg.norm(vectors, axis=-1)[..., None, None]
     skews = np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
     versines = np.sinc(angles / (2 * np.pi)) ** 2 / 2  # (1 - cos) / angle^2; np.sinc(x) is sin(pi x) / (pi x)
@@ -192,7 +192,7 @@ def rotation_from_quaternion(quaternion: Expression) -> Expression:
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Return unit quaternions [w, x, y, z] with w >= 0 of numeric rotation matrices (Shepperd 1978).
 
-    Shape (M, 3, 3) to (M, 4).
+    Shapes (M, 3, 3) -> (M, 4).
     """
     r = np.asarray(rotation, dtype=float)
     trace = np.trace(r, axis1=1, axis2=2)
@@ -232,9 +232,7 @@ def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the matrix, (6, 6), that transforms wrenches or momenta from frame B to A: motion_transform's inverse
-    transpose.
-    """
+    """Return the matrix, (6, 6), that transforms wrenches or momenta from frame B to A, given the pose of B in A."""
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
     return ca.vertcat(ca.horzcat(turn, ca.mtimes(skew(position), turn)), ca.horzcat(zero, turn))
@@ -242,7 +240,7 @@ def force_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Return the solution of a linear system with a small, symmetric, positive definite matrix. Shape of `right`.
+    """Solve the linear system A x = right for x, where A, `matrix`, is small, symmetric and positive definite.
 
     L D L' elimination without pivoting or square roots, meant for n <= 7, with a third of the operations of ca.solve;
     only the lower triangle is read. An indefinite matrix is not detected, and a singular one gives inf or nan.

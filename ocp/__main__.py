@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _version() -> str:
-    """Return the version of the installed package, or a note that it is not installed."""
+    """Return the version of the installed package, or a note that the package is not installed."""
     try:
         return version("selfmotion")
     except PackageNotFoundError:
@@ -110,7 +110,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report_error(options: argparse.Namespace, error: Exception, status: int) -> int:
-    """Print an error message, with --json also as JSON, and return the exit status."""
+    """Print an error message, also as JSON if the option --json is given, and return the exit status."""
     message = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         message = f"{PART.sub('', str(error.filename))}: {error.strerror}"
@@ -124,7 +124,7 @@ def _report_error(options: argparse.Namespace, error: Exception, status: int) ->
 
 
 def _printable(text: str) -> str:
-    """Escape the control characters in a text, which may quote files, because a terminal would interpret them."""
+    """Escape control characters, which a terminal would interpret, in a text that may quote files."""
     return CONTROLS.sub(lambda match: repr(match[0])[1:-1], text)
 
 
@@ -305,7 +305,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
 def _command(
     commands: Any, name: str, short: str, about: str, examples: str, run: CommandFunction
 ) -> argparse.ArgumentParser:
-    """Add a subcommand to the command line and return its parser."""
+    """Add a subcommand to the command line, and return the parser of the subcommand."""
     subcommand: argparse.ArgumentParser = commands.add_parser(
         name, help=short, description=about, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -316,7 +316,7 @@ def _command(
 
 
 def _file(parser: Any, name: str, description: str, short: str = "", **more: Any) -> None:
-    """Add an argument that names a file to a parser."""
+    """Add an argument to a parser. The value of the argument is the path of a file."""
     if name.startswith("-"):
         more.setdefault("metavar", "FILE")
     action = parser.add_argument(*([short] if short else []), name, type=Path, help=description, **more)
@@ -324,12 +324,12 @@ def _file(parser: Any, name: str, description: str, short: str = "", **more: Any
 
 
 def _force(parser: argparse.ArgumentParser) -> None:
-    """Add the option --force to a parser."""
+    """Add to a parser the option --force, which allows existing files to be overwritten."""
     parser.add_argument("--force", action="store_true", help="also overwrite files that selfmotion did not write")
 
 
 def robot_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that describe the robot: tip, locked joints, load, pose of the base, meshes."""
+    """Add to a parser the options that describe the robot: tip, locked joints, load, pose of the base, meshes."""
     group = parser.add_argument_group("the robot")
     group.add_argument("--tip", metavar="LINK", help="link that carries the tip")
     group.add_argument(
@@ -343,7 +343,7 @@ def robot_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the subcommand `check`."""
+    """Add to a parser the options of the subcommand `check`."""
     file = parser.add_argument_group("the file")
     file.add_argument("--columns", metavar="NAMES", help="of a table without a header: time,joint1,...")
     file.add_argument("--period", type=float, metavar="S", help="sampling period of a table or KRL without times, s")
@@ -385,7 +385,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Parse JOINT=NUMBER or NUMBER; return the joint, "" if there is none, and the number."""
+    """Parse "JOINT=NUMBER" or "NUMBER". Return the name of the joint, "" if there is none, and the number."""
     name, _, value = text.rpartition("=")
     try:
         return name, float(value)
@@ -394,7 +394,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def _named_number(text: str) -> tuple[str, float]:
-    """Parse NAME=VALUE: return the name and the number."""
+    """Parse "NAME=VALUE", and return the name and the number."""
     name, value = _limit(text)
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
@@ -402,7 +402,7 @@ def _named_number(text: str) -> tuple[str, float]:
 
 
 def _pair(text: str) -> tuple[str, str]:
-    """Parse LINK,LINK: return the two names."""
+    """Parse "LINK,LINK", and return the names of the two links."""
     first, comma, second = text.partition(",")
     if not comma or not first.strip() or not second.strip():
         raise argparse.ArgumentTypeError(f"{text!r} is not two names, LINK,LINK")

@@ -37,7 +37,7 @@ FIRST_STARTS = ("guess", "displaced guess")
 
 @dataclass(frozen=True)
 class AdaptiveCollocation:
-    """Collocation on a mesh that is refined until the cost is accurate enough; the method of ``solve(problem)``.
+    """Direct collocation on a mesh that is refined until the cost is accurate; the default method of ``solve``.
 
     Attributes:
         accuracy: Accuracy of the cost: largest relative cost that the controls may lose, and largest relative
@@ -69,7 +69,7 @@ class AdaptiveCollocation:
         compiled: bool = False,
         scaling: bool = True,
     ) -> AdaptiveProblem:
-        """Return an object that solves the problem with the given options; see :func:`ocp.methods.prepare`.
+        """Return an object that solves the given problem with the given options; see :func:`ocp.methods.prepare`.
 
         ``compiled`` and ``scaling`` apply to the first mesh, where most of the iterations take place.
         """
@@ -78,12 +78,12 @@ class AdaptiveCollocation:
 
 
 def default_method() -> AdaptiveCollocation:
-    """Return the method by which :func:`ocp.methods.solve` solves a problem without a method."""
+    """Return the method that :func:`ocp.methods.solve` uses if the caller gives none."""
     return AdaptiveCollocation()
 
 
 class AdaptiveProblem:
-    """A problem that adaptive collocation solves, on as many meshes as necessary."""
+    """An optimal control problem with the options by which :class:`AdaptiveCollocation` solves it."""
 
     def __init__(
         self, problem: Problem, method: AdaptiveCollocation, options: dict[str, Any], how: dict[str, Any]
@@ -95,7 +95,7 @@ class AdaptiveProblem:
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
     ) -> Solution:
-        """Solve the problem, refine its mesh, and return the last plan; its ``refinement`` records the rounds.
+        """Solve the problem, refine its mesh, and return the last plan, whose ``refinement`` records all rounds.
 
         Args:
             parameters, guess, time_limit: As of :func:`ocp.methods.solve`.
@@ -140,7 +140,7 @@ class AdaptiveProblem:
             return self._refined(mesh, plan, parameters)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
-        """Refine the mesh of a plan by collocation, and return the plan on the last mesh."""
+        """Solve by collocation on finer and finer meshes, starting from a plan; return the plan on the last mesh."""
         report(f"refining a plan of cost {plan.cost:.6g}")
         settings = RefinementSettings(
             limits={"lost": self.method.accuracy}, max_intervals=self.method.max_intervals, solver=self._how["solver"]
@@ -160,7 +160,7 @@ class AdaptiveProblem:
     def _first_plans(
         self, mesh: DirectMethod, parameters: ByName, guesses: tuple[Guess, Solution | None], ends: list[str]
     ) -> list[Solution]:
-        """Solve the problem on a first mesh from several starting points, and return the plans.
+        """Solve the problem on a first mesh from several initial guesses, and return the plans.
 
         ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
         """
@@ -184,7 +184,7 @@ class AdaptiveProblem:
         return plans
 
     def _failure(self, cause: SolveError, guess: Guess, ends: list[str]) -> SolveError:
-        """Return the error that no first mesh has a plan, with the conflicting constraints that a last solve found."""
+        """Return the SolveError for a problem without a plan on any first mesh, with the conflicting constraints."""
         lines = [f"problem {self.problem.name!r} has no plan on any of the meshes tried", *str(cause).splitlines()]
         unknown = [name for name in self.formulation.states if name not in guessed_names(self.formulation, guess)]
         hint = f" states {', '.join(unknown)} have no guess" if unknown else ""

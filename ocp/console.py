@@ -69,7 +69,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the call: set the flag ``stop`` and, if the call does not end, raise KeyboardInterrupt in its thread."""
+        """Stop the public call in this thread: set ``stop`` and, if it does not end, raise KeyboardInterrupt in it."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -151,10 +151,10 @@ def reason_to_stop() -> SolverStatus | None:
 
 @contextmanager
 def time_limited(seconds: float | None, *, processor: bool = False) -> Iterator[None]:
-    """Limit the total time of the solves in a ``with`` block; None keeps the limit of an enclosing block.
+    """Limit the total time of the solves in a ``with`` block.
 
-    The limit is on the wall time or, if `processor` is set, on the processor time of the program, so that what is found
-    within it does not depend on other programs.
+    None keeps the limit of an enclosing block. The limit is on the wall time or, if `processor` is set, on the
+    processor time of the program, so that what is found within it does not depend on other programs.
     """
     wall_end, processor_end = _DEADLINES.get()
     if seconds is not None and processor:
@@ -169,13 +169,13 @@ def time_limited(seconds: float | None, *, processor: bool = False) -> Iterator[
 
 
 def time_left() -> float:
-    """Return the time that remains until the time limit, s; infinite without a limit, negative after the limit."""
+    """Return the time until the time limit, s: infinite without a limit, negative after the limit has passed."""
     wall, processor = _DEADLINES.get()
     return min(wall - time.monotonic(), processor - time.process_time())
 
 
 class TimeLimitReached(Exception):
-    """Error that the time limit has passed; the function that set the limit catches and reports it."""
+    """Error raised when the time limit has passed, which the function that set the limit catches and reports."""
 
 
 def check_time() -> None:
@@ -283,9 +283,9 @@ def _is_interactive() -> bool:
 
 
 class Progress:
-    """Progress of a command or call: a line on a terminal or in a notebook after `delay` seconds, or lines of a log.
+    """Progress display of a command or call: a line on a terminal or in a notebook, or lines in a log.
 
-    A log has a line at the start, every 30 s and at the end.
+    The line appears after `delay` seconds. A log has a line at the start, every 30 s and at the end.
     """
 
     def __init__(self, title: str, quiet: bool = False, delay: float = TERMINAL_DELAY_S) -> None:
@@ -400,7 +400,7 @@ class IterationMonitor(ca.Callback):  # type: ignore[misc]
 
 
 class FatropMonitor(IterationMonitor):
-    """Function that serves as callback of fatrop: called at each iterate, it returns 1 to continue or 0 to stop."""
+    """Callback that the solver fatrop evaluates at each iterate; it returns 1 to continue or 0 to stop."""
 
     def __init__(self, n: int, title: str) -> None:
         super().__init__(n, 0, 0, title=title, show=False)

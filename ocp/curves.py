@@ -13,7 +13,7 @@ import scipy
 
 @dataclass(frozen=True)
 class PiecewisePolynomial:
-    """A piecewise polynomial, given on every interval by its values at the same relative positions (nodes).
+    """A piecewise polynomial, given in every interval by its values at the same relative positions (nodes).
 
     Attributes:
         breaks: Ends of the intervals, increasing. Shape (K + 1,).
@@ -34,20 +34,20 @@ class PiecewisePolynomial:
         return f"<PiecewisePolynomial of {intervals} intervals of {nodes} nodes, {columns} columns>"
 
     def __call__(self, at: np.ndarray) -> np.ndarray:
-        """Return the values at M positions: right limits at breaks, and constants beyond the ends. Shape (M, n)."""
+        """Evaluate the polynomial at M positions: right limits at breaks, end values beyond the ends. Shape (M, n)."""
         interval = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[interval], self.breaks[interval + 1]
         return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
 
     def derivative(self) -> PiecewisePolynomial:
-        """Return the polynomials' derivative with respect to position, in the unit of the breaks; 0 for one node."""
+        """Return the derivative of the piecewise polynomial with respect to position, in the unit of the breaks."""
         if len(self.nodes) == 1:
             return PiecewisePolynomial(self.breaks, self.nodes, np.zeros_like(self.values))
         slopes = np.einsum("ij,kjn->kin", differentiation_matrix(self.nodes), self.values)
         return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
 
     def within(self, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Return the values at relative positions 0..1 of given intervals; at a break the interval selects the side.
+        """Evaluate the polynomial at relative positions 0..1 of intervals, which select one-sided limits at breaks.
 
         Shape (M, n) for ``interval`` and ``place`` of shape (M,).
         """
@@ -55,7 +55,7 @@ class PiecewisePolynomial:
 
 
 def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
-    """Return the weights of barycentric Lagrange interpolation (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
+    """Return the d weights of barycentric Lagrange interpolation (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
     return np.asarray(1.0 / difference.prod(axis=1))
@@ -92,7 +92,7 @@ def quadrature_weights(points: np.ndarray) -> np.ndarray:
 
 
 def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the coefficients of K interpolation polynomials in Newton's form (divided differences). Shape (K, d, n).
+    """Return the coefficients (divided differences) of K interpolation polynomials in Newton's form. Shape (K, d, n).
 
     The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations. ``values``
     (K, d, n) are those at ``nodes`` (d,).
@@ -105,7 +105,7 @@ def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
-    """Return the state that the classical Runge-Kutta method reaches from the state ``x`` in one step of width ``h``.
+    """Integrate dx/dt = ``slope`` from the state ``x`` over one step of width ``h`` (classical Runge-Kutta method).
 
     ``slope(place, x)`` is dx/dt at the position 0, 1/2 or 1 of the step. States are arrays or expressions.
     """
@@ -117,7 +117,7 @@ def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
 
 
 def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> tuple[Any, Any]:
-    """Return the state after a Runge-Kutta step of order 5, and an estimate of its error (Dormand, Prince 1980).
+    """Return the state after a Runge-Kutta step of order 5, with an estimate of its error (Dormand, Prince 1980).
 
     ``slope(place, x)`` is dx/dt at a position 0..1 of the step, which starts at ``x`` and has the width ``h``. The
     error is estimated as the difference from the embedded step of order 4.

@@ -23,7 +23,7 @@ class ProblemError(DetailedError, ValueError):
 
 
 class SolveError(DetailedError, RuntimeError):
-    """Error that a solve ended without an optimum.
+    """Error raised when a solve ends without an optimum.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution, or None.
@@ -46,7 +46,7 @@ class SolveError(DetailedError, RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Error that Ctrl-C ended a solve that already had an iterate.
+    """Exception raised when Ctrl-C ends a solve that already has an iterate.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution.
@@ -58,11 +58,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class AuditError(DetailedError, RuntimeError):
-    """Error that a solution cannot be audited, for example because it was loaded without its problem."""
+    """Error raised when a solution cannot be audited, for example because it was loaded without its problem."""
 
 
 class RefinementWarning(DetailedError, UserWarning):
-    """Warning that mesh refinement stopped before the audit passed; ``value`` is the largest error-to-limit ratio."""
+    """Warning that the audit does not pass after mesh refinement; ``value`` is the largest ratio of error to limit."""
 
 
 class StorageWarning(DetailedError, UserWarning):
@@ -74,7 +74,7 @@ class BoundWarning(DetailedError, UserWarning):
 
 
 class SolverStatus(Enum):
-    """Status with which a solver ended. Its value is IPOPT's name of the status where IPOPT has one."""
+    """Status with which a solver ended. Its value is the name that IPOPT gives to the status, if there is one."""
 
     SOLVED = "Solve_Succeeded"
     ACCEPTABLE = "Solved_To_Acceptable_Level"
@@ -95,12 +95,12 @@ class SolverStatus(Enum):
 
     @classmethod
     def of_word(cls, word: str) -> SolverStatus:
-        """Return the status for the status text that a solver returns; FAILED for an unknown text."""
+        """Return the status that a solver's status text names; FAILED if the text is unknown."""
         return cls(word) if word in cls._value2member_map_ else cls.FAILED
 
     @property
     def is_success(self) -> bool:
-        """Whether the solver reports an optimum."""
+        """Whether the status reports an optimum."""
         return self in (SolverStatus.SOLVED, SolverStatus.ACCEPTABLE)
 
     @property
@@ -132,7 +132,7 @@ ADVICE = {
 
 @contextmanager
 def error_names(name: str) -> Iterator[None]:
-    """Set the field ``name`` of exceptions that the code of a ``with`` block raises without a name."""
+    """Set the attribute ``name`` of every error that a ``with`` block raises, unless it already has a name."""
     try:
         yield
     except DetailedError as error:
@@ -142,7 +142,7 @@ def error_names(name: str) -> Iterator[None]:
 
 @contextmanager
 def problem_errors(prefix: str = "") -> Iterator[None]:
-    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields, and a prefix to its message."""
+    """Convert each ModelError of a ``with`` block to a ProblemError, and add a prefix to the message."""
     try:
         yield
     except ModelError as error:
@@ -153,14 +153,14 @@ require = Checks(ProblemError)
 
 
 def format_distinct(*numbers: float) -> list[str]:
-    """Format numbers with six digits, or with more if unequal numbers would look equal."""
+    """Format numbers with six digits, or with more digits if unequal numbers would otherwise have equal texts."""
     candidates = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     different = len({repr(number) for number in numbers})
     return next((texts for texts in candidates if len({*texts}) == different), candidates[-1])
 
 
 def values_within(value: Any, upper: float, name: str, problem: str) -> np.ndarray:
-    """Return a time or distance, or several, as an array of floats clipped to the range from 0 to `upper`.
+    """Return one or several times or distances as an array of floats, clipped to the range from 0 to `upper`.
 
     The name of the argument begins the error message, and `problem` ends it for a number outside the range.
 
@@ -199,5 +199,5 @@ def sample_times(label: str, period: Any, duration: float) -> np.ndarray:
 
 
 def checked_time_limit(seconds: Any) -> float | None:
-    """Return a time limit in seconds, None for no limit; raise ProblemError unless it is positive."""
+    """Return a time limit, s, or None for no limit; raise ProblemError unless the limit is positive."""
     return None if seconds is None else require.positive("time_limit", seconds)

@@ -31,8 +31,10 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """Settings of the descent from a stationary plan that is not a minimum: the maximum number of descents, and the
-    displacement of the guess relative to the range of the plan or of its bounds (absolute if there is no such range).
+    """Settings of the descent from a stationary plan that is not a minimum.
+
+    ``descents`` is the maximum number of descents. ``move`` is the displacement of the guess, relative to the range of
+    the plan or of its bounds (absolute if there is no such range).
     """
 
     descents: int = 3
@@ -43,7 +45,7 @@ SETTINGS = DescentSettings()
 
 
 class PreparedProblem(Protocol):
-    """A problem that a method has prepared for repeated solves."""
+    """Interface of a problem that a method has prepared for repeated solves."""
 
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
@@ -57,7 +59,7 @@ P_co = TypeVar("P_co", bound=PreparedProblem, covariant=True)
 
 
 class Method(Protocol[P_co]):
-    """A method that solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
+    """Interface of a method that solves problems, such as ``Collocation``, ``MultipleShooting`` or ``Indirect``."""
 
     def prepare(
         self,
@@ -82,7 +84,7 @@ def prepare(
     compiled: bool = False,
     scaling: bool = True,
 ) -> P:
-    """Prepare a problem once, and return an object whose ``solve(parameters=, guess=)`` can be called repeatedly.
+    """Prepare a problem once, and return an object whose method ``solve`` can be called repeatedly.
 
     Args:
         problem: The problem. method: How it is transcribed.
@@ -124,7 +126,7 @@ def solve(
     check: bool = True,
     time_limit: float | None = None,
 ) -> Solution:
-    """Solve an optimal control problem by the given method, or on a mesh that is chosen and refined.
+    """Solve an optimal control problem by a given method, by default by collocation with mesh refinement.
 
     Without a method the cost is accurate to six digits (:class:`ocp.adaptive.AdaptiveCollocation`), and
     ``Solution.refinement`` states whether the audit passes. With one:
@@ -165,7 +167,7 @@ def solve(
 
 
 def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
-    """Return the given solution, or a nearby one of lower cost if a feasible variation lowers the cost.
+    """Return the given solution, or a nearby solution of lower cost if a feasible variation lowers the cost.
 
     Raises:
         SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
@@ -394,7 +396,7 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Check solutions, and return them by given names or those of the methods: ``Collocation legendre-3, 50``."""
+    """Check solutions, and return them by name. A default name describes the method: ``Collocation legendre-3, 50``."""
     if isinstance(solutions, Mapping):
         require.each("certificate: solutions", solutions.values(), Solution)
         return require.mapping("certificate: solutions", solutions)
@@ -416,8 +418,8 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Return states and controls at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` fractions,
-    and the magnitudes of Hamiltonian and running cost.
+    """Return a solution's states and controls at ``fractions`` of the horizon, its costates and Hamiltonian at
+    ``reported`` fractions, and the magnitudes of its Hamiltonian and of its running cost.
 
     The magnitudes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free
     horizon, and the mean absolute running cost.
@@ -434,6 +436,6 @@ def _sample(
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return the absolute differences of values from a reference, relative to the largest entry of the reference."""
+    """Return the absolute differences of values from a reference, relative to the reference's largest magnitude."""
     size = float(np.max(np.abs(reference), initial=0.0))
     return np.asarray(np.abs(values - reference) / (size if size > 0 else 1.0))

@@ -94,7 +94,8 @@ def refine(
     between the points on every mesh, as the polynomials of a singular arc do, they are held over each interval.
 
     Args:
-        problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
+        problem, parameters, options, guess: As for :func:`ocp.methods.solve`; a plan of the problem on the initial mesh
+            is the first plan.
         method: The method with the initial mesh. Where the problem has a jump or kink in time, give it a node:
             ``method.with_nodes_at(fractions)``.
         tolerance: Largest integration error, relative to the size of each state: over the whole horizon, or summed over
@@ -153,7 +154,7 @@ def _refine_mesh(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
-    """Refine the mesh until a plan is accurate enough, or warn if none is; return the last plan and its audit."""
+    """Refine the mesh until the plan is accurate, or warn if no mesh suffices; return the last plan and its audit."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -169,7 +170,7 @@ def _refine_mesh(
         driven = set()
 
     def assess() -> tuple[list[_Row], list[_Row]]:
-        """Record the errors of the last plan; return all of these errors, and those that exceed their limits."""
+        """Record the errors of the last plan. Return all of these errors, and the errors that exceed their limits."""
         rows = _rows(form, p, solution, audit, tolerance, method)
         intervals.append(method.intervals)
         for kind, values in errors.items():
@@ -218,7 +219,7 @@ def _refine_mesh(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return the warning that explains why the last plan does not pass its audit; None if it passes."""
+    """Return the warning that explains why the last plan does not pass its audit; None if the plan passes."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -244,8 +245,15 @@ def _first(
     settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """Solve the problem on the first mesh and audit the plan; raise SolveError on failure or at the time limit."""
-    solution = solve(problem, method, **arguments)
+    """Solve the problem on the first mesh and audit the plan; raise SolveError on failure or at the time limit.
+
+    A guess that is a plan of this problem on this mesh, for the same parameters, is the first plan.
+    """
+    vector, solution = Formulation.of(problem).parameter_vector, arguments["guess"]
+    known = isinstance(solution, Solution) and solution.success and solution.problem is problem
+    known = known and solution.method == method.settings
+    if not (known and np.array_equal(vector(arguments["parameters"]), vector(solution.parameters))):
+        solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings.limits)
     except TimeLimitReached as error:
@@ -276,7 +284,7 @@ def _next(
 
 
 class _Row(NamedTuple):
-    """An error that the audit reports: its value and each interval's contribution, relative to the error's limit.
+    """An error that the audit reports, relative to its limit: the value, and the contribution of each interval.
 
     ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
     interval width with which it falls. ``grows`` tells that unstable dynamics amplify the errors of the intervals.
@@ -290,7 +298,7 @@ class _Row(NamedTuple):
     grows: bool = False
 
     def unresolved(self, widths: np.ndarray) -> float:
-        """Return the integral over the horizon of the error beyond its limit; ``widths`` (N,) are the interval widths.
+        """Return the integral of the error over the intervals, of ``widths`` (N,), in which it exceeds its limit.
 
         Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
         only once the intervals are narrow enough.
@@ -313,7 +321,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions scaled so that their maximum (their mean if summed) is ``total``. Shape (N,)."""
+        """Scale the contributions (N,) so that their maximum, or mean if they add up, is their error ``total``."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -362,7 +370,7 @@ def _rows(
 def _violations(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit
 ) -> dict[str, tuple[bool, np.ndarray]]:
-    """Return whether each bound and path constraint is an equality, and its violation in each interval. Shape (N,)."""
+    """Return, for each bound and path constraint, whether it is an equality, and the violation per interval (N,)."""
     n = len(audit.local_errors)
     x, u = stack(audit.states), stack(audit.controls, len(audit.t))
     g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
@@ -389,7 +397,7 @@ def _mesh_at_switches(
     placed: np.ndarray,
     settings: RefinementSettings,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the next mesh with nodes at the switches of a plan, and these nodes; None if every switch has its node.
+    """Return the next mesh with nodes at the switches of a plan, and these nodes; None if every switch has a node.
 
     Splitting does not reduce the errors of an interval with a switch, which vanish with a node there.
 
@@ -419,10 +427,7 @@ def _mesh_at_switches(
 def _parts_per_interval(
     beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of parts into which to split each interval, and the interval's largest relative error.
-
-    Shape (N,) each.
-    """
+    """Return the number of parts to split each interval into, and each interval's largest error. Shape (N,) each."""
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
     if growing := [row for row in beyond if row.name == INTEGRATION and row.grows]:

@@ -123,7 +123,7 @@ class Solution:
         )
 
     def __str__(self) -> str:
-        """Return a text of at most 15 lines with method, solver, cost, and the ranges of states and controls."""
+        """Return a summary of at most 15 lines: method, solver, cost, and the ranges of states and controls."""
         head = f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
         head += f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
         if self.tightening_cost:
@@ -144,7 +144,7 @@ class Solution:
 
     @property
     def has_no_multipliers(self) -> bool:
-        """Whether the motion comes from a method without multipliers, so that its optimality cannot be judged."""
+        """Whether the motion comes from a method that computes no multipliers, which tests of optimality need."""
         return not (self.success or self.multipliers.size)
 
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
@@ -163,7 +163,7 @@ class Solution:
         return str(call_registered("html_of_solution", self))
 
     def table(self) -> dict[str, np.ndarray]:
-        """Return times, states and controls as columns by name, for a table in pandas, polars or pyarrow.
+        """Return times, states and controls as columns by name, from which pandas, polars or pyarrow make a table.
 
         The times are called ``time`` (s), the entries of a vector ``NAME[k]``. Shape (M,) each.
         """
@@ -174,7 +174,7 @@ class Solution:
         return columns
 
     def costate(self, name: str) -> np.ndarray:
-        """Return the costate of a state at the reported times: d(optimal cost)/d(state). Shape (M, n)."""
+        """Return the costate of a state, d(optimal cost)/d(state), at the reported times. Shape (M, n)."""
         return entry_named("state", name, self.costates)
 
     @interruptible
@@ -205,7 +205,7 @@ class Solution:
         return self.at_fraction(values_within(time, self.horizon, "time", words) / self.horizon)
 
     def at_fraction(self, fraction: Any) -> Sample:
-        """Return states and controls at fractions 0..1 of the horizon, as :meth:`at` does at times."""
+        """Return the interpolated states and controls at one or several fractions 0..1 of the horizon."""
         at = values_within(fraction, 1.0, "fraction", "of the horizon is outside 0 to 1")
         values: dict[str, np.ndarray] = {}
         for pool, interpolant in ((self.states, self.state_interpolant), (self.controls, self.control_interpolant)):
@@ -214,7 +214,7 @@ class Solution:
 
     @property
     def phases(self) -> dict[str, tuple[float, float]]:
-        """Start and end times (s) of all phases, by name; empty without phases (:mod:`ocp.problem.phases`)."""
+        """Start and end times, s, of all phases by name; empty for a problem without phases."""
         declared = {} if self.problem is None else self.problem.declared.phases
         parts = [part for phase in declared.values() for part in (phase.begin, phase.duration)]
         times = [float(value.item()) for value in self._sample(parts, np.ones(1))] if parts else []
@@ -291,7 +291,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan with the problem from the same file attached; raise ProblemError if the two do not match."""
+        """Return the plan with the problem of its file attached; raise ProblemError if their variables do not match."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:
@@ -355,7 +355,7 @@ class Solution:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Return the plan and its problem from a file that :meth:`save` wrote, except guesses that were functions.
+        """Read a plan and its problem from a file that :meth:`save` wrote; guesses given as functions are not stored.
 
         The file is pure data. Its problem is rebuilt from checked operations, and none of it is executed.
 
@@ -368,7 +368,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Build a solution from the arrays of a file, which are removed from ``arrays``; raise the errors of `load`."""
+        """Build a solution from the arrays of a file, and remove them from ``arrays``; raise the errors of `load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")
@@ -431,7 +431,7 @@ class Solution:
         self.__dict__.update({**state, "problem": None if problem is None else Problem.from_record(problem)})
 
     def __copy__(self) -> Solution:
-        """Return a solution that shares arrays and problem with this one."""
+        """Return a solution that shares its arrays and its problem with this one."""
         return replace(self)
 
     def __deepcopy__(self, memo: Any) -> Solution:

@@ -50,7 +50,7 @@ class Sample(dict[str, np.ndarray]):
 
 @dataclass(frozen=True)
 class Refinement:
-    """Record of a mesh refinement: number of intervals and errors in each round.
+    """Record of a mesh refinement: the number of mesh intervals and the errors in each round.
 
     ``errors`` has the largest error of each kind divided by its limit: "integration", "equalities" and "limits" (bounds
     and inequalities) between the points, lost "cost", "other" rows of the audit. ``tolerance`` is that of integration,
@@ -106,7 +106,7 @@ class Sensitivity:
 
 
 def read_head(path: Any, text: np.ndarray) -> Any:
-    """Return the header of a solution file from its JSON text; raise ProblemError if the text is too long.
+    """Return the header of a solution file, parsed from its JSON text; raise ProblemError if the text is too long.
 
     Parsing takes thirty times as much memory as the text.
     """
@@ -138,7 +138,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack the arrays (M, n) of a dictionary side by side; an empty dictionary gives ``like`` rows without columns."""
+    """Stack the arrays (M, n) of a dictionary side by side; without arrays return ``like`` rows and no columns."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
@@ -162,7 +162,7 @@ def check_variables_match(form: Any, solution: Any) -> None:
 
 
 def match_order(form: Any, solution: Any) -> Any:
-    """Return a plan with its variables in the order of the problem, because interpolants have columns without names."""
+    """Return a plan with its variables reordered as in the problem, because columns of interpolants have no names."""
     orders = {"states": list(form.states), "controls": list(form.controls), "costates": list(form.states)}
     changes: dict[str, Any] = {}
     for (pool, names), interpolant in zip(orders.items(), INTERPOLANTS, strict=True):

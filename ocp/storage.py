@@ -42,7 +42,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file in UTF-8 atomically, see :func:`write_whole`."""
+    """Write a text file in UTF-8 atomically; see :func:`write_whole`."""
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
@@ -90,7 +90,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any],
 
 
 def open_part(target: Path) -> IO[bytes]:
-    """Create a locked temporary file in the folder of a target file, to replace the target when complete."""
+    """Create a locked temporary file in the folder of a target file, which replaces the target once complete."""
     while True:
         stream = open(target.with_name(f"{target.name}.{secrets.token_hex(4)}.part"), "xb")  # noqa: SIM115
         with suppress(OSError):  # some file systems have no locks
@@ -215,12 +215,12 @@ FORMULA = re.compile(r"^[=+\-@\t\r%]")
 
 
 def column_name(name: str) -> str:
-    """Encode a joint name for a table header; special characters become %XX of their UTF-8 bytes."""
+    """Encode a joint name for a table header: each UTF-8 byte of a special character becomes %XX."""
     return ESCAPED.sub(_quote, name)
 
 
 def cell(value: Any) -> Any:
-    """Return a value for a CSV cell; in text that looks like a formula the first character becomes %XX."""
+    """Return a value for a CSV cell; if a text looks like a formula, its first character is encoded as %XX."""
     return FORMULA.sub(_quote, value) if isinstance(value, str) else value
 
 
@@ -229,17 +229,17 @@ def _quote(match: re.Match[str]) -> str:
 
 
 def joint_name(column: str) -> str:
-    """Decode a joint name that :func:`column_name` has encoded."""
+    """Decode a joint name from a table header, which :func:`column_name` has encoded."""
     return unquote(column, errors="surrogatepass")
 
 
 def table_head(names: Sequence[str]) -> list[str]:
-    """Return the column names of the table of a plan: time, then joint positions, velocities and accelerations."""
+    """Return the column names for the table of a plan: time, then joint positions, velocities and accelerations."""
     return ["time", *(column_name(name) + suffix for suffix in SUFFIXES for name in names)]
 
 
 def table_joints(head: Sequence[str]) -> tuple[str, ...]:
-    """Return the joint names in a table header that :func:`table_head` made; empty for any other header."""
+    """Return the joint names in a table header; empty for a header that :func:`table_head` has not produced."""
     try:
         names = tuple(map(joint_name, head[1 : 1 + len(head) // 3]))
     except UnicodeDecodeError:

@@ -57,14 +57,14 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 class Switches(NamedTuple):
-    """Horizon fractions (k,) where limits become active or inactive; mask (N,) of mesh intervals in transition."""
+    """Switches of a plan, where limits become active or inactive, and mesh intervals that contain a switch."""
 
-    fractions: np.ndarray
-    smeared: np.ndarray
+    fractions: np.ndarray  # of the horizon, at the switches; shape (k,)
+    smeared: np.ndarray  # mask of the mesh intervals that contain a switch; shape (N,)
 
 
 def locate_switches(problem: Problem, solution: Solution) -> Switches:
-    """Return where along a plan limits become active or inactive, and the mesh intervals in these transitions.
+    """Return the switches of a plan, where limits become active or inactive, and the mesh intervals that contain them.
 
     ``solution`` is a plan of ``problem`` by collocation with controls at the points.
     """
@@ -155,7 +155,7 @@ class _Arcs:
 
 
 def _limited_values(form: Formulation, solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return limited quantities at all control nodes, their limits, and whether a control occurs in each quantity.
+    """Return the limited quantities at all control nodes, their limits, and whether each depends on a control.
 
     The values (M, m) are those of controls, path constraints with a control, states, and other path constraints.
     """
@@ -175,7 +175,7 @@ def _limited_values(form: Formulation, solution: Solution) -> tuple[np.ndarray, 
 def solve_at_switches(
     problem: Problem, method: Collocation, plan: Solution, *, parameters: ByName = None, options: ByName = None
 ) -> Solution:
-    """Solve a problem again with mesh nodes at the switches of its plan; each round locates them more accurately.
+    """Solve a problem again with mesh nodes at the switches of its plan, which each round locates more accurately.
 
     Args:
         problem, parameters, options: As for :func:`ocp.methods.solve`.
@@ -203,7 +203,7 @@ def solve_at_switches(
 
 
 def nodes_at_switches(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return a mesh with nodes at switches, and without old nodes that are close to a switch."""
+    """Add nodes at switches to a mesh, remove the old nodes that are close to a switch, and return the new mesh."""
     width = np.diff(mesh)
     after = np.clip(np.searchsorted(mesh, at, side="right"), 1, len(width)) - 1
     before = np.clip(np.searchsorted(mesh, at, side="left"), 1, len(width)) - 1

@@ -26,7 +26,7 @@ from ocp.tolerances import SOLVER_SHARE
 
 @dataclass(frozen=True)
 class TighteningSettings:
-    """Settings of :func:`tighten`, which tightens the limits of a plan.
+    """Settings of :func:`tighten`, which solves a problem under tightened limits.
 
     Attributes:
         places, rounds: Evaluation points per interval and polynomial degree of the plan, and maximum number of rounds.
@@ -55,7 +55,7 @@ def tighten(
     time_limit: float | None = None,
     max_cost: float = np.inf,
 ) -> Solution:
-    """Solve with IPOPT, with limits tightened so that every inequality also holds between grid points.
+    """Solve a problem by IPOPT with limits tightened so that every inequality also holds between grid points.
 
     The plan is the optimum under bounds that are tightened where it would exceed them, so its cost is slightly above
     that of :func:`ocp.methods.solve`, by ``Solution.tightening_cost``; finer grids close the gap. Equalities are not
@@ -134,7 +134,7 @@ def tighten(
 
 
 def largest_excess(problem: Problem, solution: Solution) -> float:
-    """Return a plan's largest violation of a bound or inequality, also between grid points, in the bound's unit."""
+    """Return a plan's largest violation of a bound or inequality, in the bound's unit, also between grid points."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
     return float(_excess(form, solution, p, *_limits_of(form, p))[0].max(initial=0.0))
@@ -148,7 +148,7 @@ def _limits_of(form: Formulation, p: np.ndarray) -> Bounds:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return a text about the largest excess over a bound, given all excesses, and the fields of the SolveError."""
+    """Return a text that reports the largest excess over a bound, and the fields of the corresponding SolveError."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -160,7 +160,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return the bounded quantity that each variable ("x") and constraint ("g") represents, and its mesh intervals.
+    """Return which bounded quantity each variable ("x") and constraint ("g") represents, and in which mesh intervals.
 
     The quantity is an index among the stacked states, controls and path constraints, or -1. The indices of two
     intervals, left and right, differ at a node between intervals. Unless ``shared``, a control at a node, and rows with
@@ -196,7 +196,7 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance of values from their lower and upper bounds in each mesh interval. Shape (2, N, m).
+    """Return the smallest distances of values from their lower and upper bounds in each mesh interval. Shape (2, N, m).
 
     It is infinite for a bound without grid values in the interval.
     """
@@ -213,8 +213,8 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest violation of both bounds in each mesh interval (2, N, m), and the ends (N + 1,) of the
-    intervals, s.
+    """Return the largest violation of the lower and of the upper bounds in each mesh interval (2, N, m), and the ends
+    (N + 1,) of the intervals, s.
     """
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
@@ -232,7 +232,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the maxima of sampled curves (N, K, m) from parabolas through neighbouring samples. Shape (N, m)."""
+    """Return the maxima of sampled curves (N, K, m), estimated by parabolas through three samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))

@@ -44,12 +44,13 @@ def test_command_and_module_run_the_same_function() -> None:
     assert module == "ocp.__main__"
 
 
+@pytest.mark.parametrize("script", ["from ocp import plan", "import models\nimport ocp.app.files"])
 @pytest.mark.parametrize("name", ["models.py", "models/__init__.py"])
-def test_a_module_of_the_same_name_is_reported_with_the_remedy(name: str, tmp_path: Path) -> None:
+def test_a_module_of_the_same_name_is_reported_with_the_remedy(name: str, script: str, tmp_path: Path) -> None:
     other = tmp_path / name
     other.parent.mkdir(exist_ok=True)
     other.write_text("Robot = None\n")
-    (tmp_path / "script.py").write_text("from ocp import plan\n")
+    (tmp_path / "script.py").write_text(script)
     result = run(tmp_path, sys.executable, "script.py", PYTHONSAFEPATH="")
     assert result.returncode == 1
     last = result.stderr.strip().splitlines()[-1]

@@ -52,7 +52,7 @@ _Record = TypeVar("_Record")
 
 
 class Incumbent(NamedTuple):
-    """The best feasible roll angle that the search for the rig's optimal roll has found so far.
+    """Best feasible roll angle that the search for the optimal roll of a captive trajectory rig has found so far.
 
     Attributes:
         cost: Value of the index at the roll; inf if there is none yet.
@@ -70,7 +70,7 @@ class Incumbent(NamedTuple):
 
 
 class RoughRoll(NamedTuple):
-    """Approximation of a roll angle that may be optimal, stored as cosine and sine.
+    """Approximation of a roll angle of the rig that may be optimal, with a lower bound of the cost near it.
 
     Attributes:
         bound: Lower bound of the cost near the point; inf if the roll is infeasible.
@@ -89,14 +89,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost at a roll angle (inf if pitch reach or joints 4 to 6 exclude it), and the cosine of joint angle 2 there."""
+    """Cost of a roll angle, inf if the pitch link or joints 4 to 6 exclude the angle, and cosine of joint angle 2."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2 (joint angle 2) at which a constraint is active, and a lower bound of the cost near it.
+    """A value of cos q2 (q2: angle of joint 2) at which a constraint is active, and a lower bound of the cost near it.
 
     `side` is as in RoughRoll.
     """
@@ -114,7 +114,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Inverse kinematics solution: joint positions (6, 1) of the rig, cost, codes of active constraint and status."""
+    """Result of the rig's inverse kinematics: joint positions (6, 1), cost, codes of active constraint and status."""
 
     joints: Expression
     cost: Expression
@@ -123,7 +123,7 @@ class RigSolution(NamedTuple):
 
 
 def stack(kind: Any, records: Sequence[Any]) -> Expression:
-    """Return named tuples of one class as the columns of a matrix. Shape (fields, records)."""
+    """Return the matrix whose columns are given named tuples of one class. Shape (fields, tuples)."""
     return ca.horzcat(*[ca.vertcat(*record) for record in records]) if records else ca.SX(len(kind._fields), 0)
 
 
@@ -143,7 +143,7 @@ def _inputs(symbols: Any) -> tuple[Any, Any]:
 def optimal_inverse(
     rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
 ) -> Any:
-    """Return the casadi Function that computes the rig's joint positions for a target at the roll angle of least cost.
+    """Return the CasADi Function that computes the rig's joint positions for a target at the roll angle of least cost.
 
     Args:
         rig: Dimensions and joint limits.
@@ -188,7 +188,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the rig's best roll angle; its methods return the casadi Functions that perform its steps.
+    """Search for the rig's roll angle of least cost; its methods return the CasADi Functions that perform its steps.
 
     The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
     RoughRoll. Their result `answer` is a RigSolution.
@@ -203,7 +203,7 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the casadi Function that finds the best roll angle among the stationary points of the cost index.
+        """Return the CasADi Function that finds the best roll angle among the stationary points of the cost index.
 
         (target, previous) -> (answer, done, best, evaluations). `done` says that the answer is final: it is within
         reach and limits, or the input is not finite.
@@ -242,7 +242,7 @@ class Search:
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the casadi Function that searches the ends of feasible roll intervals for a roll of lower cost.
+        """Return the CasADi Function that searches the ends of feasible roll intervals for a roll angle of lower cost.
 
         (target, previous, best, `count` evaluations) -> answer.
         """
@@ -268,7 +268,7 @@ class Search:
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
     def _closed_form_ends(self) -> Any:
-        """Return the casadi Function that compares the best roll so far with closed-form ends of roll intervals.
+        """Return the CasADi Function that compares the best roll with closed-form ends of feasible roll intervals.
 
         (target, previous, best) -> (best, evaluations).
         """
@@ -281,14 +281,14 @@ class Search:
         )
 
     def _rough_stationary(self) -> Any:
-        """Return the casadi Function that approximates the roll angles at which the cost index I1 is stationary.
+        """Return the CasADi Function that approximates the roll angles at which the rig's cost index is stationary.
 
         (target) -> rough; NO_ROLL if there is only one minimum. In the axes of trigonometric.least_point there are only
         two stationary points outside the astroid |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4
         r encloses.
         """
         target, _ = _inputs(ca.SX)
-        rough, f = self._approximation(target), self._index(target)
+        rough, f = self._rough_roll_function(target), self._index(target)
         points = [rough(c, s) for c, s in roots(f.derivative(), steps=0)]
         approximate = ca.Function("rough", [target], ca.cse([stack(RoughRoll, points)]))
         first, second = ca.sqrt(f.a1**2 + f.b1**2), ca.sqrt(f.a2**2 + f.b2**2)
@@ -298,7 +298,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the casadi Function that compares the best roll so far with rolls that put joint 2 or 3 at a limit.
+        """Return the CasADi Function that compares the best roll so far with rolls at which joint 2 or 3 is at a limit.
 
         (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
         evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
@@ -316,7 +316,7 @@ class Search:
             levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
         needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
 
-        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._approximation(target)
+        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._rough_roll_function(target)
         _, cosine, code, _, side = _record(LevelBound, suspect)
         ends = level_points(self.rig, target, cosine)
         points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
@@ -343,12 +343,12 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the casadi Function that compares the best roll so far with rolls that put joint 1 at a limit.
+        """Return the CasADi Function that compares the best roll so far with rolls at which joint 1 is at a limit.
 
         (target, previous, best) -> best.
         """
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
-        rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
+        rough, reach = self._rough_roll_function(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
         ends = [rough(points[0, k], points[1, k], *datum, about=reach) for k in range(8)]
         near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
@@ -362,14 +362,14 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of changes of sin q4 and cos q2 (joint angles) as the roll changes by ROOTS.root_tolerance."""
+        """Return bounds of the changes of sin q4, cos q2 (joint angles q) if the roll changes by the root tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
-    def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that computes a lower bound of the cost index near an approximate roll angle.
+    def _rough_roll_function(self, target: Expression) -> Callable[..., RoughRoll]:
+        """Return the function from a roll angle (cosine, sine) to its RoughRoll, with a lower bound of the cost nearby.
 
         `about` = (middle, half width) is the range of cos q2 outside of which the bound is inf.
         """
@@ -389,7 +389,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the casadi Function that refines `count` approximate rolls and compares them with the best so far.
+        """Return the CasADi Function that refines `count` approximate rolls and returns the best of them and of `best`.
 
         (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
         """
@@ -409,7 +409,7 @@ class Search:
         return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of the cost index I1 near an approximate roll angle, by Newton's method."""
+        """Return the stationary point of the cost index near an approximate roll angle, by Newton's method."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
@@ -417,7 +417,7 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare given rolls with the best roll so far, `best`, and return the best of all.
+        """Compare given roll angles with the best one so far, `best`; return the best of all and the given ones' costs.
 
         The result is (Incumbent, list of Evaluation, cost): evaluations and least cost are those of the given rolls.
         """
@@ -449,20 +449,20 @@ class Search:
         return configuration_at(self.rig, target, c, s, branch=self.branch)
 
     def _finish(self) -> Any:
-        """Return the casadi Function that computes the joint positions at the best roll angle that the search found."""
+        """Return the CasADi Function that computes the joint positions at the best roll angle that the search found."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the casadi Function for an infeasible target: joint positions nan, and the reason as status."""
+        """Return the CasADi Function for infeasible targets; it returns nan joint positions and a reason as status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return joints, cost and status of the wind-tunnel rig at the best roll angle so far, as a column (9, 1)."""
+        """Return joint positions, cost, active constraint and status at the best roll so far as a column, (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
@@ -476,7 +476,7 @@ def _is_finite(target: Expression, previous: Expression) -> Expression:
 
 
 def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
-    """Return a Function that returns a known value if a condition holds, and otherwise evaluates another Function.
+    """Return a CasADi Function that returns a known value if a condition holds, and otherwise calls another Function.
 
     (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments). The alternative is only
     evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.

@@ -106,7 +106,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Return the capsules that represent the rig's links, from yaw link 1 to the sting, by name of the link."""
+    """Return the capsules that represent the rig's links at joint positions q, keyed by link name."""
     require.instance("rig: rig", rig, Rig)
     radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
     frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
@@ -162,7 +162,7 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """Return a required clearance, m; raise a ModelError unless it is finite, or -inf for no constraint."""
+    """Return a required clearance (m); raise a ModelError unless it is finite, or -inf, which means no constraint."""
     if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
@@ -201,7 +201,7 @@ class Avoidance:
 def collision_free_inverse(
     rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
-    """Return the casadi Function that computes the joint positions for a target at the best collision-free roll angle.
+    """Return the CasADi Function that computes the joint positions for a target at the best collision-free roll angle.
 
     (target, previous) -> (joints, cost, active, status, gap).
 
@@ -210,7 +210,7 @@ def collision_free_inverse(
         rate_weight: w4 of I2; 0 for I1.
 
     Returns:
-        A casadi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is the code
+        A CasADi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is the code
         of "clearance" if this constraint is active, else that of the closed form if its roll is best, else that of
         "free". The status "clearance" means that a roll reaches the target within limits, but none without collision.
 
@@ -263,7 +263,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects the lowest local minima of merit values on a roll grid.
+    """Return the symbolic inputs and outputs of a Function that selects the lowest local minima on a grid of rolls.
 
     (merits) -> columns (angle, merit, step), one for each minimum.
     """
@@ -284,7 +284,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects, of several roll angles, the angle of least cost.
+    """Return symbolic inputs and outputs of a Function that selects, of several roll angles, the angle of least cost.
 
     (angles, values) -> (best angle, least value, whether it is the first).
     """
@@ -298,7 +298,7 @@ def _least_value(count: int) -> tuple[list[Any], list[Any]]:
 
 
 def _pattern_search(merit: Any) -> Any:
-    """Return the Function that minimises the merit function by pattern searches from several roll angles.
+    """Return the CasADi Function that minimises a merit function of the roll by pattern searches from several rolls.
 
     (states, inputs) -> states. A state is (angle, merit, step); the inputs are target and previous roll.
     """

@@ -26,7 +26,7 @@ LENGTHS = ("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goo
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Dimensions and joint limits of a captive trajectory rig.
+    """Dimensions and joint limits of a captive trajectory rig, whose six joints move a model in a wind tunnel.
 
     Attributes:
         yaw_link_1, yaw_link_2: Ly1 and Ly2, the links after joints 2 and 3. m.
@@ -77,18 +77,18 @@ class Rig:
         return float((self.upper if upper else self.lower)[joint - 1])
 
     def middle_and_half(self, joint: int) -> tuple[float, float]:
-        """Return the middle and half the length of the range of a joint (number 1 to 6) with both limits, m or rad."""
+        """Return the middle and half-width of the range of a joint (number 1 to 6) that has both limits, m or rad."""
         low, high = self.limit(joint, False), self.limit(joint, True)
         return (low + high) / 2, (high - low) / 2
 
     def unlimited(self) -> Rig:
-        """Return the rig without joint limits."""
+        """Return a copy of the rig without joint limits."""
         return Rig(*(getattr(self, name) for name in LENGTHS))
 
 
 @dataclass(frozen=True, eq=False)
 class Tunnel:
-    """Data of the cost index I1, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
+    """Wind tunnel data for the cost, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
 
     Attributes:
         center: P_C of equation (35) in world. Shape (3,), m.
@@ -110,12 +110,12 @@ class Tunnel:
 
     @property
     def scale(self) -> Array:
-        """Diagonal of the weight matrix D of the cost index I1: weights / ranges^2. Shape (3,), 1/m^2."""
+        """Diagonal of the weight matrix of the squared distance in the cost: weights / ranges^2. Shape (3,), 1/m^2."""
         return np.asarray(self.weights / self.ranges**2)
 
 
 class Branch(NamedTuple):
-    """One of the four branches of the rig's inverse kinematics, given by two signs.
+    """One of the four branches of the rig's inverse kinematics, given by the signs of sin q2 and cos q4 (joint angles).
 
     Attributes:
         yaw: Sign of sin q2: +1 for q2 = +acos(.) in equation (25), -1 for -acos(.), the side of the home position.
@@ -136,7 +136,7 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll angle and a branch.
+    """Joint positions q1, q2, q4 and the point of the goose-neck's corner for a target, a roll angle and a branch.
 
     Attributes:
         corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.
@@ -181,7 +181,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the pose (x, y, z, yaw, pitch, roll) of the tool frame in the world. Shape (6, 1), m and rad.
+    """Return the pose (x, y, z, yaw, pitch, roll) of the tool at joint positions q, in world. Shape (6, 1), m and rad.
 
     Equations (16) to (22) of the paper. Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
@@ -219,7 +219,7 @@ def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Express
 
 
 def corner_of_roll(rig: Rig, target: Expression, c: Expression, s: Expression) -> Expression:
-    """Return the world position of the goose-neck's corner for a roll given by cosine and sine. Shape (3, 1), m."""
+    """Return the goose-neck corner's world position for a target and a roll (cosine c and sine s). Shape (3, 1), m."""
     axle, cosine_part, sine_part = corner_circle(rig, target)
     return axle + rig.goose_neck * (c * cosine_part + s * sine_part)
 
@@ -237,7 +237,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
-    """Return the rig's configuration for a target and a roll angle, by equations (23), (25), (27) of Lee, Lee 2017."""
+    """Return the joint positions of the rig for a tool pose and a roll angle about the tool axis, in closed form."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
@@ -271,7 +271,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
 
 
 def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: RigConfiguration) -> Expression:
-    """Return the joint positions of a rig configuration, each angle in the turn nearest to mid-range. Shape (6, 1)."""
+    """Return the joint positions, (6, 1), of a rig configuration, each angle shifted by full turns near mid-range."""
     q2 = ca.atan2(configuration.sin2, configuration.cos2)
     q4 = ca.atan2(configuration.sin4, configuration.cos4)
     angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]

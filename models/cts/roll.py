@@ -67,7 +67,7 @@ COSINE_SLACK = 1e-7
 
 
 class Candidate(NamedTuple):
-    """A roll angle that may be optimal, given by cosine and sine, and the index in ACTIVE of the active constraint."""
+    """A roll angle that may be optimal, given by cosine and sine, and the index of its active constraint in ACTIVE."""
 
     c: Expression
     s: Expression
@@ -98,7 +98,7 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end.
+    """A value of cos q2, the cosine of the angle of joint 2, at which an interval of feasible roll angles may end.
 
     Attributes:
         cosine: The value.
@@ -114,12 +114,12 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the code, an index in ACTIVE, of the lower or upper position limit of a joint (number 1 to 6)."""
+    """Return the index in the list ACTIVE of the lower or upper position limit of a joint (number 1 to 6)."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1, a squared distance from the tunnel's centre, as a polynomial of roll harmonics.
+    """Return the cost index I1, a squared distance from the tunnel's centre, as a trigonometric polynomial of the roll.
 
     Equation (36) of Lee, Lee 2017.
     """
@@ -157,7 +157,7 @@ def check_constraints(
 
 
 def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
-    """Return an index in STATUS: the reason (reach of a link, joint limits) why a target has no feasible roll."""
+    """Return the index in the list STATUS of the reason why a target has no feasible roll: reach or joint limits."""
     rig = rig.unlimited()
     axle, e_c, _ = corner_circle(rig, target)
     pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
@@ -171,7 +171,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return roll angles that include all ends of the feasible intervals except the ends at limits of joint 1."""
+    """Return roll angles that include all ends of feasible roll intervals except those at limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -186,7 +186,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the possible ends of feasible roll intervals that have a closed form.
+    """Return those possible ends of the rig's feasible roll intervals that have a closed form.
 
     They are due to the limits of joints 4 to 6 and to the reach of the pitch link.
     """
@@ -214,7 +214,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append a value of cos q2 to `levels`, marked as an interval end only if joint 3 is then within its limits."""
+        """Append to `levels` a value of cos q2 where intervals may end; irrelevant if joint 3 is then beyond limits."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -238,7 +238,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate roll angles, as (cos, sin), at which the cosine of joint angle 2 has a given value.
+    """Return four approximate roll angles, as (cos, sin), at which the cosine of joint 2's angle has a given value.
 
     They are roots of the squared equation cos q2 = `cosine`. The squared equation is smooth near a stretched pitch
     link, where cos q2 is not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.
@@ -260,7 +260,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 (joint angle 4) at which feasible rolls may end, with codes of the limits."""
+    """Return the values of sin q4 (joint angle 4) at which feasible roll intervals may end, and codes of the limits."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -281,7 +281,7 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits; `slack` is a cosine tolerance."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits, up to a tolerance of cosines."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -297,7 +297,8 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function from target and roll angle to cos q2, q1 and cos q4 of the rig's joints q.
+    """Return the CasADi Function from target and roll angle to cos q2 and q1 (q: joint positions), whose limits bound
+    the feasible roll angles, and to cos q4, on which the rounding error of cos q2 depends.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll angle. Other functions take the Function as their argument `chart`.
@@ -310,12 +311,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll angle at which the rig's cos q2 (`output` 0) or q1 (2) has a given value, by Newton steps."""
+    """Return the roll angle at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2 (joint angle 2) has a limit value, on the feasible side despite rounding.
+    """Return the roll angle at which cos q2 (angle of joint 2) equals a limit, on the feasible side despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
@@ -327,7 +328,7 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return, as a function of the roll angle, cos q2 or q1 minus a value; `polish` finds the root of this function.
+    """Return a function of the roll angle that is zero where cos q2, or the joint position q1, has a given value.
 
     `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
     derivative.
@@ -346,7 +347,7 @@ def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: 
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return a casadi Function that computes the roll angles at which joint 1 is at its lower or upper limit.
+    """Return a CasADi Function that computes the roll angles at which joint 1 is at its lower or upper limit.
 
     The angles include all ends of feasible intervals at the limit. (target) -> (2, 8), rows cosine and sine of the
     roll.
@@ -361,7 +362,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return a casadi Function that approximates the roll angles at which joint 1 is at a limit. Output (2, 8)."""
+    """Return a CasADi Function for the roll angles (8 cosines and sines) at which the prismatic joint is at a limit."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -387,9 +388,9 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the factor of the squared change of roll in the cost index I2: the rate weight divided by 2 pi.
+    """Check the weight w4 of the squared change of roll in the cost index I2, and return its factor w4 / (2 pi).
 
-    The factor is w4 / (2 pi), equation (37) of the paper.
+    Equation (37) of the paper.
 
     Raises:
         ModelError: The weight w4, `rate_weight`, is negative or not finite.
@@ -398,7 +399,7 @@ def checked_gain(rate_weight: float) -> float:
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the roll angle, given by cosine and sine, that is within joint 6's limits and nearest to `previous`."""
+    """Return the angle (rad) of a roll given by cosine and sine, within joint 6's limits and nearest to `previous`."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -406,7 +407,7 @@ def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) ->
 
 
 def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
-    """Return the ends of the interval of admissible roll angles, at most a turn long, nearest to the previous roll."""
+    """Return both ends of the interval of admissible rolls, at most a full turn long, nearest to the previous roll."""
     start, low, high = previous - np.pi, rig.limit(6, False), rig.limit(6, True)
     if not np.isfinite(low):
         return start, start + FULL_TURN
@@ -415,7 +416,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function from target and previous roll to five roll angles that include all minima of their cost.
+    """Return a CasADi Function from target and previous roll to five roll angles that include all minima of the cost.
 
     The cost is the index I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex, its one minimum
     is repeated. Otherwise the window of rolls is split where I1'' = -2 gain, and each interval yields one roll.
@@ -441,7 +442,7 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 def minimize_convex(
     f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the roll angle of least cost index I2 on an interval where I2 is convex, by Newton steps in a bracket."""
+    """Return the roll angle of least cost index I2 in a bracket where I2 is convex, by Newton and bisection steps."""
     a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start

@@ -73,7 +73,7 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joint positions of least cost index for every target of a table.
+    """Return the joint positions that minimise the cost index I1 or I2 for every target of a table.
 
     A target without a solution does not affect the others.
 
@@ -196,7 +196,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 
 @lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Return casadi Functions for the possible ends of feasible roll intervals and for the feasibility of a roll.
+    """Return CasADi Functions for the possible ends of feasible roll intervals and for the feasibility of a roll angle.
 
     (target) -> points, with rows cosine, sine and code of the constraint in roll.ACTIVE; (target, roll) -> feasible.
     """
@@ -215,14 +215,14 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Return targets (x, y, z, yaw, pitch), one per row of an array; raise a ModelError about the first invalid row."""
+    """Return targets (x, y, z, yaw, pitch), one per row of an array; raise ModelError about the first invalid row."""
     rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
     warn_of_degrees("table: yaw or pitch", rows[:, 3:], "targets")
     return rows
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """Return the casadi Functions of a rig's forward and inverse kinematics, by name, for tables or export to C.
+    """Return the CasADi Functions of a rig's forward and inverse kinematics, by name, for tables or export to C.
 
     `.map(samples)` applies a Function to a table. forward: (joints) -> (pose). inverse: (target, roll) -> (joints,
     reach), see `rig.inverse`. corner: (target, roll) -> (P_G). arc_ends, feasible: see `roll_interval_functions`.
@@ -243,10 +243,10 @@ def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: 
 
 
 def export(functions: dict[str, Any] | Iterable[Any], path: Path) -> Path:
-    """Write casadi Functions as a C file and its header; the code needs only the C mathematics library.
+    """Write CasADi Functions as a C file and its header; the code needs only the C mathematics library.
 
     Args:
-        functions: casadi Functions, or a dictionary of them.
+        functions: CasADi Functions, or a dictionary of them.
         path: Path of the C file; its folder is created.
 
     Raises:

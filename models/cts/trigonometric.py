@@ -67,15 +67,15 @@ class Harmonics(NamedTuple):
     b2: Expression
 
     def value(self, c: Expression, s: Expression) -> Expression:
-        """Return the value of the polynomial at the angle with a given cosine and sine."""
+        """Return the value of the trigonometric polynomial at the angle with a given cosine and sine."""
         return self.a0 + self.a1 * c + self.b1 * s + self.a2 * (c * c - s * s) + 2 * self.b2 * c * s
 
     def derivative(self) -> Harmonics:
-        """Return the derivative of the polynomial with respect to the angle."""
+        """Return the derivative of the trigonometric polynomial with respect to the angle."""
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return an upper bound of the polynomial's second derivative in magnitude, hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return hypot(a1, b1) + 4 hypot(a2, b2), which bounds how fast the slope of the polynomial changes."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
@@ -143,7 +143,7 @@ def roots(f: Harmonics, steps: int = ROOTS.polish_steps) -> list[Point]:
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return the rotation that removes the mixed term x y of a polynomial on the unit circle, and its new coefficients.
+    """Return the rotation that removes the mixed term x y of a polynomial on the unit circle, and the new coefficients.
 
     The rotation is (cosine, sine). With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the
     rotated axes. `shift` is added to a2, so that the second harmonic has a direction.
@@ -203,7 +203,7 @@ def polish(
     max_polish_step: float = ROOTS.max_polish_step,
     floor: float = SMALLEST_DIVISOR,
 ) -> Point:
-    """Refine an approximate root, a point of the unit circle, by Newton steps of limited size (rad).
+    """Refine a point of the unit circle, an approximate root of a function of the angle, by bounded Newton steps.
 
     `function` returns value and derivative with respect to the angle. If the square of the derivative is below `floor`
     the steps vanish.
@@ -225,7 +225,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the parameter in [-1, 1] at which the pencil of conics that `roots` uses contains a pair of real lines.
+    """Return the parameter in [-1, 1] at which a combination of the conics that `roots` intersects is two real lines.
 
     The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """
@@ -270,7 +270,7 @@ def multiply_series(f: Series, g: Series) -> Series:
 
 
 def add_series(f: Series, g: Series, factor: float = 1) -> Series:
-    """Return the sum f + factor g of two trigonometric series."""
+    """Return the sum f + factor g of two trigonometric series f and g."""
     zero: Series = [(0.0, 0.0)]
     size = max(len(f), len(g))
     longer = [f + zero * (size - len(f)), g + zero * (size - len(g))]
@@ -278,7 +278,7 @@ def add_series(f: Series, g: Series, factor: float = 1) -> Series:
 
 
 def series_roots(degree: int) -> Any:
-    """Return the casadi Function that finds the simple roots of a trigonometric series from its coefficients.
+    """Return the CasADi Function that finds the simple roots of a trigonometric series from its coefficients.
 
     The roots are points of the unit circle. Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and
     sine. The roots z = exp(i angle) of the polynomial z^degree f are computed simultaneously (Aberth 1973) in at most
@@ -346,7 +346,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the casadi Function that performs `count` iterations of Aberth's method for all roots of a polynomial.
+    """Return the CasADi Function that performs `count` iterations of Aberth's method for all roots of a polynomial.
 
     (roots, coefficients) -> (roots, excess of the last step over the tolerance).
     """

@@ -44,7 +44,7 @@ class PlacedShape(NamedTuple):
 
 
 class Levers(NamedTuple):
-    """Upper bounds of the relative velocity of the bodies of n pairs of bodies, per unit rate of each coordinate.
+    """Upper bounds of the relative velocity of the bodies in each of n pairs, per unit rate of each coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
@@ -141,14 +141,14 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the machine with some joints locked, without pairs that then keep their distance.
+        """Return the scene of the machine with some joints locked, without pairs whose distance is then constant.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the pairs that the user excludes from checks: of two links, and of a link and an obstacle."""
+        """Return the pairs that the user excludes from checks: pairs of links, and pairs of a link and an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}
@@ -160,7 +160,7 @@ class CollisionScene:
     def _pairs_with_obstacles(
         self, own: Sequence[Body], ignored: set[tuple[str, str]]
     ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], Reason]]:
-        """Return the index pairs (body, obstacle) that may collide, and the reasons why others are excluded."""
+        """Return the index pairs (body, obstacle) that may collide, and the reasons why other pairs are excluded."""
         pairs, excluded = [], dict[tuple[str, str], Reason]()
         for number, obstacle in enumerate(self.obstacles):
             name = f"obstacle {number}"
@@ -214,7 +214,7 @@ class CollisionScene:
         set_fields(self, pairs=np.array(pairs, dtype=int).reshape(-1, 3))
 
     def _reference_link(self, first: Body, second: Body) -> str:
-        """Return the link farthest from the root that carries both bodies."""
+        """Return the link farthest from the root of the kinematic tree that carries both given bodies."""
         return self._parts.common_part(*(self._parts.of_link[body.link] for body in (first, second)))
 
     @property
@@ -223,7 +223,7 @@ class CollisionScene:
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
-        """Return the names of the two bodies of a checked pair: of two links, or of a link and an obstacle."""
+        """Return the names of the two bodies of a checked pair: two links, or a link and an obstacle."""
         first, second, _ = self.pairs[pair]
         return self.bodies[first].link, self.bodies[second].link
 
@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason for each pair of links, named "A and B", that is not checked because it seems to collide always."""
+        """Reasons why pairs of links that seem to collide permanently are not checked, by "A and B" (link names)."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -248,7 +248,7 @@ class CollisionScene:
         return any(isinstance(obstacle, MovingObstacle) for obstacle in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
-        """Return rotation and position of each frame of links and moving obstacles as one column. Shape (12 F, 1)."""
+        """Return rotation and position of all F frames of links and moving obstacles as one column. Shape (12 F, 1)."""
         frames = self._frames(base, q, time)
         columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
@@ -262,7 +262,7 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Return the signed distances of pairs of bodies for a configuration of the machine. Shape (n, 1), m.
+        """Return the signed distances of n pairs of bodies for a configuration of the machine. Shape (n, 1), m.
 
         They are exact or lower bounds, see `distance`. For two hulls of meshes the distance is that of their covers, a
         lower bound.
@@ -297,7 +297,7 @@ class CollisionScene:
         return ca.vertcat(*distances) if distances else expression(q)[:0]
 
     def distance_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> Any:
-        """Return the CasADi Function that computes the signed distances of pairs of bodies and their gradients.
+        """Return the CasADi Function that computes the signed distances of pairs of bodies, and their gradients.
 
         (base, q, time) -> distances (n, 1), m, and gradients for base and q, (n, base_size + joint_size), about fifteen
         times faster than `distances` and its Jacobian. For a base with a quaternion, gradients hold along rates that
@@ -308,7 +308,7 @@ class CollisionScene:
         return _distance_gradients(self, groups, rounding)
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
-        """Return the indices of the requested pairs (None requests all) and the smoothing width after checking both."""
+        """Return the indices of the requested pairs (all if None) and the smoothing width, after checking both."""
         indices = np.arange(len(self.pairs))
         if isinstance(pairs, list | tuple) and not pairs:
             indices = indices[:0]
@@ -318,7 +318,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative velocity of each pair; raises ModelError for a prismatic joint without limits."""
+        """Bounds of the pairs' relative velocity per unit joint rate; ModelError for an unlimited prismatic joint."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -351,7 +351,7 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return pairs of bodies that are checked by convex hulls of meshes, not covers, grouped by pair of meshes.
+        """Return pairs of bodies checked by convex hulls of meshes, not by covering shapes, grouped by pair of meshes.
 
         They have at most three joints between them and may be closer by design than the covers of their meshes allow,
         or their covers always collide.
@@ -370,7 +370,7 @@ class CollisionScene:
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the velocity bounds (`Levers`) of one body relative to the frame of a link, or to the world (-1)."""
+        """Return bounds of a body's velocity per unit rate of joints and base, relative to a link or the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         levers = Levers(np.zeros(size), np.zeros(size), np.zeros(robot.dof), np.zeros(robot.dof))
         if not 0 <= placed.frame < len(self._carriers):
@@ -427,7 +427,7 @@ def _pair(value: Any, number: int) -> tuple[str, str]:
 
 
 def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[int, int]]], rounding: float) -> Any:
-    """Return the CasADi Function of `CollisionScene.distance_gradients` for groups of pairs of body indices.
+    """Return the CasADi Function that computes the least distance in each group of body pairs, and its gradient.
 
     Each distance is the minimum over one group.
     """
@@ -474,7 +474,7 @@ def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[i
 
 
 def _motion_signs(scene: CollisionScene, pairs: Array, joints: Sequence[str]) -> Array:
-    """Return 1 where a coordinate moves only a pair's first body, -1 where only its second, else 0. Shape (n, k)."""
+    """Return, for n pairs and k coordinates, 1 where only the first body moves, -1 where only the second, else 0."""
     size, carriers = scene.machine.base_size, scene._carriers
     carried = np.zeros((len(scene.bodies), size + len(joints)))
     for k, body in enumerate(scene.bodies):

@@ -92,7 +92,7 @@ class FreeFloating:
 
     @property
     def base_size(self) -> int:
-        """Length of the base configuration: 3 for a planar base (x, y, angle), 7 for a spatial one."""
+        """Number of coordinates of the base: 3 for a planar base (x, y, angle), 7 for a spatial one (pose)."""
         return 3 if self.base == "planar" else 7
 
     @property
@@ -118,7 +118,7 @@ class FreeFloating:
 
     @on_scalars
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
-        """Return the frame of the tip in the world."""
+        """Return the pose of the tip frame in the world: rotation (3, 3), position (3, 1) in m."""
         world_from_base = self.world_from_base(base)
         tip = tip_frame(self.robot, frames_and_axes(self.robot, q)[0])
         turned = ca.mtimes(world_from_base.rotation, tip.rotation)
@@ -126,8 +126,9 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian, eq. (25), which maps joint rates to tip twist minus drift. Shape (6,
-        joint_size).
+        """Return the generalized Jacobian, (6, joint_size), from joint rates to the tip's twist without momentum drift.
+
+        Equation (25) of Kim and Kim (2011).
         """
         return self._tip_motion(base, self._reaction(q, None, tip=True))
 
@@ -139,7 +140,10 @@ class FreeFloating:
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the base twist E1^-1 (momentum - E2 joint_rates), eq. (24) of Kim and Kim 2011. Shape (6 or 3, 1)."""
+        """Return the base twist that follows from joint rates and conserved momentum. Shape (6, 1) or (3, 1).
+
+        Equation (24) of Kim and Kim (2011): E1^-1 (momentum - E2 joint_rates) with the `momentum_matrices` E1, E2.
+        """
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
@@ -171,7 +175,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24) of Kim and Kim (2011).
+        """Return matrices E1, E2 of the total momentum E1 base_twist + E2 joint_rates, eq. (24) of Kim and Kim (2011).
 
         Shapes (6, 6) and (6, joint_size), rows (moment of momentum about the world's origin, linear momentum), world
         axes; (3, 3) and (3, joint_size) with the rows (Lz, Px, Py) for a planar base.
@@ -185,7 +189,10 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Return the total momentum (angular about the world's origin, linear), (6, 1), or (Lz, Px, Py) if planar."""
+        """Return the total momentum: angular about the world's origin, then linear. Shape (6, 1); (3, 1) if planar.
+
+        For a planar base the rows are (Lz, Px, Py).
+        """
         locked, joints = self.momentum_matrices(base, q)
         twist = checked_vector("base_twist", base_twist, len(self.twist_rows), "angular velocity, then linear")
         return ca.mtimes(locked, twist) + ca.mtimes(joints, joint_vector(self.robot, joint_rates, "joint_rates"))
@@ -223,7 +230,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum at given rates minus the conserved momentum, zero for every possible motion."""
+        """Return the momentum at given rates minus the conserved momentum, which is zero for every possible motion."""
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
         if carried is None:
@@ -234,7 +241,7 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates, equation (25) of Kim and Kim (2011).
+        """Return the matrices F1, F2 of the tip's twist F1 base_twist + F2 joint_rates, eq. (25) of Kim and Kim (2011).
 
         Shapes (6, 6), or (6, 3) for a planar base, and (6, joint_size).
         """
@@ -248,7 +255,7 @@ class FreeFloating:
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of the generalized Jacobian, see jacobian_manipulability. Shape (1, 1)."""
+        """Return Yoshikawa's manipulability of selected rows of the generalized Jacobian. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
     def _tip_motion(self, base: Expression, reaction: _Reaction) -> Expression:
@@ -257,7 +264,7 @@ class FreeFloating:
         return ca.densify(ca.vertcat(angular, linear))
 
     def _checked_base(self, base: Expression) -> Expression:
-        """Return the base configuration as a column; raise ModelError if the size is wrong."""
+        """Return the base configuration as a column; raise ModelError if its size is wrong."""
         meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
         return checked_vector("base", base, self.base_size, meaning)
 
@@ -322,7 +329,7 @@ class FreeFloating:
 
 
 class _Reaction(NamedTuple):
-    """Velocities of base and tip, in base axes: one column for given joint rates, or one per joint for unit rates."""
+    """Velocities of base and tip in base axes: one column for given joint rates, or one per joint for unit rates."""
 
     base_angular: Expression
     base_linear: Expression
@@ -344,7 +351,7 @@ def _require_planar(robot: Robot) -> None:
 
 
 def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    """Raise ModelError if the robot lacks the inertia by which conserved momentum determines the base motion."""
+    """Raise ModelError if, for lack of inertia, conserved momentum does not determine the base motion of a robot."""
     if robot.total_mass == 0:
         raise massless_error("without which no momentum tells how its base floats")
     # A stretched chain of point masses lacks inertia about one axis in a single configuration, so several are tried.

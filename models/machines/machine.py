@@ -62,25 +62,19 @@ class Machine(Protocol):
         """Return the pose of the root link's frame in the world."""
 
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
-        """Return the frame of the tip in the world: rotation (3, 3), position (3, 1) in m."""
+        """Return the pose of the tip frame in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the matrix, (6, joint_size), that maps joint rates to the tip's twist, including the base motion they
-        cause.
-        """
+        """Return the matrix, (6, joint_size), from joint rates to the tip's twist, including base motion they cause."""
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the tip's twist, tip_jacobian times joint_rates plus the drift due to conserved momentum. Shape (6,
-        1).
-        """
+        """Return the tip's twist (6, 1): tip_jacobian times joint_rates plus the drift due to conserved momentum."""
 
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the rate of the base configuration, including the drift due to momentum. Shape (base_size, 1)."""
+        """Return the time derivative of the base configuration, including momentum drift. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of a task that fixes rows of the tip's twist, see jacobian_manipulability. Shape
-        (1, 1).
-        """
+        """Return Yoshikawa's manipulability of the given rows of the tip Jacobian. Shape (1, 1)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +124,7 @@ class FixedBase:
         return Frame(expression(self.rotation), expression(self.translation))
 
     def tip_pose(self, base: Expression, q: Expression) -> Frame:
-        """Return the frame of the tip in the world."""
+        """Return the pose of the tip frame in the world: rotation (3, 3), position (3, 1) in m."""
         self.world_from_base(base)
         return Frame(*self._pose_function(joint_vector(self.robot, q)))
 
@@ -158,11 +152,11 @@ class FixedBase:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the rate of the base configuration, which is empty because the base is fixed. Shape (0, 1)."""
+        """Return the time derivative of the base configuration, empty because the base is fixed. Shape (0, 1)."""
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return Yoshikawa's manipulability of the tip Jacobian, see jacobian_manipulability. Shape (1, 1)."""
+        """Return Yoshikawa's manipulability of the given rows of the tip Jacobian. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
 
@@ -201,8 +195,8 @@ def _with_robot(machine: Machine) -> Any:
 
 
 def base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Return the twist (angular, linear at the world's origin) of the base per unit rate of its coordinates. Shape (6,
-    size).
+    """Return the base's twist (angular, linear at the world's origin) per unit rate of each of its coordinates. Shape
+    (6, size).
     """
     orientation, position = (ca.SX(part) for part in world_from_base)
     twists = []
@@ -269,7 +263,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Return the rotor inertias (kg m^2), by joint, of reaction wheels: joints whose angle has no effect on dynamics.
+    """Return the rotor inertias (kg m^2), by joint, of reaction wheels: joints whose angle does not affect dynamics.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

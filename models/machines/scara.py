@@ -96,7 +96,7 @@ class Scara:
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Return the frame of the tool in the world for joint positions, shape (4,), as CasADi matrix or numbers."""
+        """Return the pose of the tool in the world for joint positions, shape (4,), as CasADi matrix or numbers."""
         q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -135,8 +135,7 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi (0 for the quill) that shifts the range `least` to `most` into the limits of a
-        joint.
+        """Return the multiple of 2 pi (0 for the quill) that shifts positions `least` to `most` into a joint's limits.
 
         Return None if no multiple does; the tolerance is 1e-9 rad or m.
         """
@@ -149,7 +148,7 @@ class Scara:
         return turn if low <= least + turn and most + turn <= high else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
-        """Return closed-form joint positions for a tool pose (x, y, z, yaw) in the world. Shape (4, 1).
+        """Return closed-form joint positions of the arm for a tool pose (x, y, z, yaw) in the world. Shape (4, 1).
 
         Reach and limits are not checked. sin q2 is computed from the product of the distances to both ends of the
         reach, which is accurate near them.
@@ -169,7 +168,7 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from pose (x, y, z, yaw) and three derivatives to joint positions and theirs."""
+        """Return the CasADi Function from tool pose and three derivatives to joint positions and three derivatives."""
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
         pose = inputs[0] + at * (inputs[1] + at * (inputs[2] / 2 + at * inputs[3] / 6))
@@ -181,7 +180,7 @@ class Scara:
         return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
 
     def check_reach(self, radius: float, place: str) -> None:
-        """Raise ModelError, which names `place`, unless the arm reaches points `radius` (m) from the shoulder axis."""
+        """Raise ModelError naming `place` unless the arm reaches the distance `radius` (m) from its shoulder axis."""
         if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
                 f"scara: {place} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
@@ -195,7 +194,7 @@ ANGLES = [0, 1, 3]
 
 
 class JointsAlong(NamedTuple):
-    """Joint positions along a path and three derivatives with respect to arc length. Shape (M, 4) each, rad and m."""
+    """Joint positions at M points of a path, with three derivatives with respect to arc length. Shape (M, 4) each."""
 
     position: Array
     first: Array
@@ -220,7 +219,7 @@ class ScaraPath:
         return self.scara.names
 
     def at(self, distance: ArrayInput) -> JointsAlong:
-        """Return joint positions, with continuous angles, and three derivatives at arc lengths (M,), m, on the path."""
+        """Return joint positions with continuous angles, and three derivatives, at M arc lengths (m) along the path."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
         table_s, table_q = self.table
@@ -274,7 +273,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
-    """Return the tool poses (x, y, z, yaw) along a path and three derivatives at M arc lengths. Shape (4, M) each."""
+    """Return the tool poses (x, y, z, yaw) at M arc lengths of a path, with three derivatives. Shape (4, M) each."""
     position, orientation = path.at(s), path.turn(s)
     yaw = 2 * np.arctan2(orientation.quaternion[:, 3], orientation.quaternion[:, 0])
     angular = (yaw, orientation.rate[:, 2], orientation.acceleration[:, 2], orientation.jerk[:, 2])
@@ -327,7 +326,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return arc length and value of a function's maximum (`sign` 1) or minimum (-1), refined between samples."""
+    """Return the arc length at which a sampled function is largest (`sign` 1) or smallest (-1), and the value there."""
     padded = np.concatenate([[-np.inf], sign * values, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
     # a resolved peak exceeds its sample by less than the sample differs from its neighbours

@@ -57,7 +57,7 @@ class Foot:
 
     @classmethod
     def of(cls, robot: Robot, link: str, rotation: ArrayInput = None) -> Self:
-        """Return the foot whose sole is formed by the lowest collision shapes of a link, see `models.footprint`.
+        """Return the foot whose sole is the support polygon (`footprint`) of a link's lowest collision shapes.
 
         The origin of the sole's frame is below that of the link's frame.
 
@@ -72,7 +72,7 @@ class Foot:
 
     @cached_property
     def corners(self) -> Array:
-        """Corners of the sole in the sole's frame; for a grip, the origin of that frame alone. Shape (k, 3), m."""
+        """Corners of the sole in the sole's frame, or that frame's origin for a grip without sole. Shape (k, 3), m."""
         if self.sole is None:
             return np.zeros((1, 3))
         plane = np.asarray(self.sole.vertices)
@@ -81,7 +81,7 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class Foothold:
-    """Pose, in the world, of the frame of a foot's sole while the foot is fixed on the ground.
+    """Pose in the world of the sole frame of a foot while the foot is fixed on the ground.
 
     Attributes:
         position: Origin of the frame in the world. Shape (3,), m.
@@ -97,7 +97,7 @@ class Foothold:
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
-        """Return a foothold on level ground at x, y and a height (m), rotated by a heading (rad) about the vertical."""
+        """Return a foothold on level ground at (x, y, height), m, rotated by a heading (rad) about the vertical."""
         numbers = {"x": x, "y": y, "heading": heading, "height": height}
         x, y, heading, height = (require.number(f"foothold: {name}", value) for name, value in numbers.items())
         turn = [[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
@@ -166,7 +166,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot after merging links that fixed joints connect: the same dynamics, evaluated faster."""
+        """The robot with links on fixed joints merged into their parents: the same dynamics, evaluated faster."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -199,7 +199,7 @@ class Stance(FixedBase):
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the contact loads of all standing feet during a motion, given the loads of all but the first foot."""
+        """Return the contact wrenches (loads) of all standing feet in a motion, given those of all but the first."""
         reaction = base_reaction(self.bodies, q, qd, qdd, **self._forces(others))
         first = next(iter(self.footholds))
         moment, force = reaction[:3], reaction[3:]
@@ -209,11 +209,11 @@ class Stance(FixedBase):
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
-        """Return the joint torques (or forces) of a motion, given the loads of all but the first foot. Shape (n, 1)."""
+        """Return the joint torques (or forces) of a motion, given the loads of all feet but the first. Shape (n, 1)."""
         return inverse_dynamics(self.bodies, q, qd, qdd, **self._forces(others))
 
     def _forces(self, others: Mapping[str, Expression]) -> dict[str, Any]:
-        """Return arguments of `base_reaction` and `inverse_dynamics`: contact wrenches, gravity, pose of the root."""
+        """Return keyword arguments of `base_reaction` and `inverse_dynamics`: contact wrenches, gravity, root pose."""
         others = require.mapping("stance: others", others)
         if set(others) != set(self.other_feet):
             message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"
@@ -228,10 +228,9 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Indices of those components of a foot's twist that the joints can change, for each foot but the first.
+        """Indices of the load components, for each foot but the first, along which the joints can move the foot.
 
-        In world axes, they are all six, or three in a plane. The load of a foot has the same rows: nothing resists the
-        others.
+        In world axes, they are all six, or three in a plane. The other components of the load are taken as zero.
 
         Raises:
             ModelError: These rows are always dependent, because the robot's plane is oblique to the axes.
@@ -260,7 +259,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return all six components, (6, 1), of a foot's load from those in `load_rows`; the others are always zero."""
+        """Return all six components, (6, 1), of a foot's load from those in `load_rows`; the other ones are zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -273,8 +272,7 @@ class Stance(FixedBase):
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
-        """Return the moments, (k, 1), of a foot's load about the edges of its sole, nonnegative while the foot does not
-        tip.
+        """Return the moments, (k, 1), of a foot's load about its sole's edges, nonnegative while the foot does not tip.
 
         Each is the distance of the center of pressure from an edge, less a margin (m), times the pressure, N m. Only
         edges from which motion can change that distance count; a grip has none.
@@ -342,7 +340,7 @@ class Stance(FixedBase):
 
     @cached_property
     def support(self) -> Support | None:
-        """Convex hull of all standing soles, seen from above; None if a standing foot is a grip."""
+        """Convex hull of the soles of all standing feet, seen from above; None if one of these feet is a grip."""
         if any(self.feet[name].sole is None for name in self.footholds):
             return None
         points = [
@@ -352,8 +350,8 @@ class Stance(FixedBase):
         return Support(convex_hull(np.vstack(points)))
 
     def zero_moment_point(self, loads: Mapping[str, Expression]) -> Expression:
-        """Return the zero moment point, about which the loads have no horizontal moment, at the first foothold. Shape
-        (2, 1), m.
+        """Return the zero moment point in the horizontal plane of the first foothold: the loads have no horizontal
+        moment about it. Shape (2, 1), m.
         """
         moment, force = ca.DM(3, 1), ca.DM(3, 1)
         positions = [np.asarray(self.footholds[name].position) for name in loads]

@@ -59,7 +59,7 @@ class ZmpRows(NamedTuple):
     right: Expression  # C, with gravity and the wrenches. Shape (2, 1).
 
     def needed(self, qd: Expression) -> Expression:
-        """Return J_m q'' = C - q'^T H_m q', the moments that joint accelerations must produce. Shape (2, 1), N m."""
+        """Return the moments that joint accelerations must produce to keep the zero moment point. Shape (2, 1), N m."""
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 
@@ -147,18 +147,19 @@ class Standing(FixedBase):
         return inverse_dynamics(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
 
     def _forces(self, wrenches: Sequence[Wrench]) -> dict[str, Any]:
-        """Return arguments of `base_reaction` and `inverse_dynamics`: external wrenches, gravity, pose of the foot."""
+        """Return keyword arguments of `base_reaction` and `inverse_dynamics`: external wrenches, gravity, foot pose."""
         return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:
-        """Return 1 - ((point - most_stable_point) / half_widths)^2, (5) and (6) of Yoo et al. 2004. Shape (2, 1)."""
+        """Return the stability index 1 - ((point - most_stable_point) / half_widths)^2 in x and y. Shape (2, 1).
+
+        Equations (5) and (6) of Yoo et al. 2004.
+        """
         offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return condition (18) of Yoo et al. 2004, which fixes the zero moment point at `point`, (2,), m, under
-        `wrenches`.
-        """
+        """Return the linear equation for the joint accelerations that puts the zero moment point at `point` (2,), m."""
         external = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector("point", point, 2, "x and y on the ground")
         q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
@@ -207,7 +208,7 @@ class Standing(FixedBase):
         return tuple(axis for axis in (0, 1) if self.moving_directions[:, axis].any())
 
     def nearest_reachable(self, point: ArrayInput) -> Array:
-        """Return the zero moment point, reachable by joint motion, that is nearest to `point`. Shape (2,), m."""
+        """Return the point nearest to `point` to which joint motion can shift the zero moment point. Shape (2,), m."""
         target = require.array("standing machine: point", point, (2,))
         projection = self.moving_directions.T @ self.moving_directions
         return np.asarray(projection @ target + (np.eye(2) - projection) @ self._sampled_points.mean(axis=0))
@@ -224,7 +225,7 @@ def center_of_pressure(reaction: Expression) -> Expression:
 
 
 def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
-    """Return the external wrench function of a spring at the tip, which exerts the force -stiffness (tip - rest).
+    """Return the function that gives the external wrench of a spring at the tip, the force -stiffness (tip - rest).
 
     Args:
         stiffness: Along world x, y, z. Shape (3,), N/m.
@@ -262,7 +263,7 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Friction coefficient required: horizontal over vertical ground force; inf without contact. Shape (M,)."""
+        """Required friction coefficient: horizontal over vertical ground force, inf without contact. Shape (M,)."""
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
@@ -285,11 +286,11 @@ class StandingMotion:
 
     @property
     def stands(self) -> bool:
-        """Whether the machine neither lifts off nor tips. A stability index of 1 does not imply this."""
+        """Whether the machine neither lifts off nor tips, which a stability index of 1 does not imply."""
         return self.stays_on_ground and self.stays_in_foot
 
     def summary(self) -> dict[str, float | bool]:
-        """Return the extreme values of the motion's quantities, and whether the machine stands, by name."""
+        """Return extreme values of forces, margins and joint quantities of the motion, and whether the robot stands."""
         zmp = self.zero_moment_point
         return {
             "stands": self.stands,
@@ -313,7 +314,7 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function from (time, q, qd, qdd) to the computed attributes of a `StandingMotion`, by name.
+    """Return the CasADi Function from (time, q, qd, qdd) to the attributes that a `StandingMotion` computes, by name.
 
     Its symbols are SX, or MX if `external` requires it.
     """
@@ -354,7 +355,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Evaluate a result of `motion_function` at M times; return its outputs by name: (M, k), or (M,) for scalars."""
+    """Evaluate a Function of `motion_function` at M times; return its outputs by name: (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}

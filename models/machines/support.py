@@ -96,12 +96,12 @@ class Support:
 
     @cached_property
     def normals(self) -> Array:
-        """Inward unit normals of the polygon's edges; edge i runs from corner i to the next. Shape (k, 2)."""
+        """Inward unit normals of the polygon's edges; edge i runs from corner i to the next corner. Shape (k, 2)."""
         edges = np.roll(self.vertices, -1, axis=0) - self.vertices
         return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
 
     def distances(self, point: Expression) -> Expression:
-        """Return the signed distance of a point from the line of each edge, positive inside. Shape (k, 1), m."""
+        """Return the signed distance of a point from each polygon edge's line, positive inside. Shape (k, 1), m."""
         point = checked_vector("point", point, 2, "x and y on the ground")
         offsets = (self.normals * self.vertices).sum(axis=1)
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)

@@ -64,7 +64,7 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 from rest to rest at a fraction s of the duration.
+    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5, from rest to rest, at a fraction s of the duration.
 
     Accepts numbers, arrays and expressions.
     """
@@ -76,7 +76,7 @@ def rest_to_rest(s: Expression) -> Expression:
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
     """Return the coefficients of the cubic with given end points and first derivatives, eqs (1)-(7) of Lee et al. 2006.
 
-    The derivatives are in the curve parameter u. Shapes (..., 3) to (..., 6, 3).
+    The derivatives are in the curve parameter u. Shapes (..., 3) -> (..., 6, 3).
     """
     chord = end - start
     zero = np.zeros_like(chord)
@@ -88,7 +88,7 @@ def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array
 def quintic(start: End, end: End) -> Array:
     """Return the coefficients of the quintic curve with given end points and first and second derivatives at the ends.
 
-    An end is (point, first derivative, second derivative), with respect to the curve parameter u. Shapes (..., 3) to
+    An end is (point, first derivative, second derivative), with respect to the curve parameter u. Shapes (..., 3) ->
     (..., 6, 3).
     """
     (start_value, start_rate, start_second), (end_value, end_rate, end_second) = start, end
@@ -104,7 +104,7 @@ def quintic(start: End, end: End) -> Array:
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
-    """Return points or derivatives of polynomial curves at parameters u. Shapes (..., 6, 3), (...) to (..., 3)."""
+    """Return points, or derivatives, of polynomial curves at parameters u. Shapes (..., 6, 3), (...) -> (..., 3)."""
     factors = _falling_factorials(order)
     value = coefficients[..., 5, :] * factors[5]
     u = np.asarray(u, dtype=float)[..., None]
@@ -120,7 +120,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return how far a blend's middle is from the corner between two lines, divided by how far its ends are from it.
+    """Return the distance of a blend's middle from the corner between two lines, relative to that of the blend's ends.
 
     Equation (8): |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, the distance
     at u = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -134,14 +134,14 @@ def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
 
 
 def curvature(coefficients: Array, u: Array) -> Array:
-    """Return the curvature of polynomial curves at curve parameters u. Shapes (..., 6, 3), (...) to (...), 1/m."""
+    """Return the curvature of polynomial curves at curve parameters u. Shapes (..., 6, 3), (...) -> (...), 1/m."""
     first, second = polynomial(coefficients, u, 1), polynomial(coefficients, u, 2)
     bend = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
 def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Return points of polynomial curves at curve parameters u, and three derivatives with respect to arc length."""
+    """Return points of polynomial curves at parameters u, and three derivatives of them with respect to arc length."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -171,16 +171,16 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the shape factors of least peak curvature of quintic blends between two lines at interior angles. Shape
-    (V,).
+    """Return the shape factors, (V,), for which quintic blends between two lines at given angles have the least peak
+    curvature. A shape factor is the length of the end tangents over the distance from vertex to blend ends.
     """
-    angles, shape_over_chord = _table()
+    angles, shape_over_chord = _shape_table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[Array, Array]:
-    """Return angles (rad) between two lines, and the best shape factors divided by the distance between blend ends."""
+def _shape_table() -> tuple[Array, Array]:
+    """Tabulate the shape factor of least peak curvature, divided by 2 sin(angle / 2), over the angle between lines."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -243,7 +243,7 @@ def _search_shapes(ends: Sequence[Array], remaining: Array, samples: int) -> Arr
 
 
 def gauss_rule(count: int) -> tuple[Array, Array]:
-    """Return nodes and weights of the Gauss-Legendre quadrature rule on [0, 1]."""
+    """Return the nodes and weights of the Gauss-Legendre quadrature rule with `count` nodes on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 
@@ -265,7 +265,7 @@ class Cells(NamedTuple):
 
 
 def speed(coefficients: Array, u: Array) -> Array:
-    """Return the parametric speed |dr/du| of curves at curve parameters u. Shapes (M, 6, 3), (M,) to (M,), m."""
+    """Return the parametric speed |dr/du| of curves r(u) at parameters u. Shapes (M, 6, 3), (M,) -> (M,), m."""
     return _speed(_derivative(coefficients), u)
 
 
@@ -346,7 +346,7 @@ def cells(coefficients: Array) -> Cells:
 def parameter(
     coefficients: Array, cells: Cells, index: NDArray[np.intp], distance: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return index and parameter u of curves at distances (m) from the starts of cells, intervals of u; (M,) each.
+    """Return curve index and parameter u of points at given arc lengths (m) from the starts of intervals of u (cells).
 
     A cubic Hermite guess from the cell's ends is refined to rounding by Chebyshev iterations.
 
@@ -376,7 +376,7 @@ def parameter(
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:
-    """Return the arc lengths (M,), m, of a curve with coefficients (6, 3) from its start to the parameters u (M,)."""
+    """Return the arc lengths (M,), m, of a polynomial curve, coefficients (6, 3), from its start to parameters u."""
     curve = coefficients[None]
     parts = cells(curve)
     index = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)
@@ -395,7 +395,7 @@ def derivative_of_columns(columns: Any) -> Any:
 
 
 def horner(columns: Any, u: Any) -> Any:
-    """Return the value of a polynomial whose coefficients of each power form one column, as an expression."""
+    """Return, as an expression, the value at u of a polynomial whose coefficients of each power form one column."""
     value = columns[:, -1]
     for j in reversed(range(columns.shape[1] - 1)):
         value = columns[:, j] + u * value
@@ -403,7 +403,7 @@ def horner(columns: Any, u: Any) -> Any:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the casadi Function that steps the curve parameter u along a blend by a predictor and several correctors.
+    """Return the CasADi Function that advances the curve parameter u along a blend by a predictor and correctors.
 
     Lee, Ryu, Cheong 2006: predictor (15), then `corrections` (3 in the paper) correctors (13) by the trapezoid rule
     (12), which lets the sample drift from its distance. The degree of the blend is 3 or 5.
@@ -423,7 +423,7 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the casadi Function that steps the curve parameter u along a blend by quadrature and Newton steps.
+    """Return the CasADi Function that advances the parameter u of a blend by arc lengths: quadrature and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`; `nodes` is the number of quadrature nodes for each Newton step, the last of which determines
@@ -445,7 +445,7 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
 
 
 def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
-    """Return the curve parameters u, (M,), of a blend at increasing distances (M,), m, from its start, step by step.
+    """Return the curve parameters u, (M,), of a blend at increasing distances (M,), m, from its start, one by one.
 
     `mapping` is a result of `predictor_corrector` or `gauss_newton`, `coefficients` are those of the blend, (6, 3).
 
@@ -469,7 +469,7 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
-    """Return symbols of the inputs of a `march` mapping (state, coefficients, steps), and the function u -> |dr/du|."""
+    """Return symbolic inputs (state, coefficients, steps) of a Function for `march`, and a curve's speed |dr/du|."""
     degree = require.choice("blend: degree", degree, (3, 5))
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())

@@ -133,8 +133,7 @@ class Path:
         return any(s.start_orientation is not None or s.end_orientation is not None for s in self.segments)
 
     def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
-        """Return points on segments and three derivatives with respect to distance, at distances (m) along the
-        segments.
+        """Return points at distances (m) along given segments, and three derivatives with respect to the distance.
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
@@ -149,7 +148,7 @@ class Path:
         return results
 
     def turn_at(self, index: NDArray[np.intp], distance: Array) -> tuple[Array, Array, Array]:
-        """Return tool orientations and their first two derivatives, in world, at distances (m) along segments.
+        """Return tool orientations and their first two derivatives, in world, at distances (m) along given segments.
 
         Shapes: index and distance (M,), results (M, 4), (M, 3), (M, 3), 1, rad/m and rad/m^2.
         """
@@ -257,7 +256,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return segments as a tuple; raise a ModelError if the list is empty or an entry is no segment."""
+    """Return segments as a tuple; raise a ModelError if the list is empty or an entry is not a segment."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -291,7 +290,7 @@ def _angles(before: Array, after: Array) -> Array:
 
 
 class FittedPath(NamedTuple):
-    """Path in which splines and lines replace runs of short segments; see `fit_splines`."""
+    """Path in which `fit_splines` has replaced runs of short segments by splines and lines."""
 
     path: Path  # the path of n segments
     first: NDArray[np.intp]  # index of the first segment of the given path that each segment replaces. Shape (n,).
@@ -362,7 +361,7 @@ def fit_splines(
 
 
 def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
-    """Return a polyline within `sagitta` (m) of a path's arcs, and the index of its point at each path vertex."""
+    """Return a polyline within a distance `sagitta` (m) of a path's arcs, and its point index at each path vertex."""
     with np.errstate(divide="ignore"):
         chord = np.where(path.is_spline, np.inf, np.sqrt(8 * sagitta / path.curvature))
     counts = np.maximum(np.ceil(path.lengths / chord), 1).astype(int)
@@ -377,7 +376,7 @@ def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
 
 
 def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: float) -> NDArray[np.bool_]:
-    """Return for each vertex of a path whether a run of segments, for a spline to replace, ends there. Shape (n + 1,).
+    """Return for each vertex of a path whether a run of segments that a spline can replace ends there. Shape (n + 1,).
 
     A curve that is within its deviation from the chord c of a simplified polyline bends by 8 deviation / c from chord
     to chord; where the path bends much more, it has a corner.

@@ -60,12 +60,12 @@ class _Corners(NamedTuple):
     vertices: NDArray[np.intp]  # indices of the vertices; 0 is the end of the first segment. Shape (V,).
 
     def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
-        """Return the corners with the given indices."""
+        """Return the corners with the given indices among these corners."""
         return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
 
     @property
     def curved(self) -> NDArray[np.intp]:
-        """Indices of the corners with an arc, a helix or a spline on at least one side."""
+        """Indices of the corners at which at least one of the two segments is an arc, a helix or a spline."""
         segments = (self.path.curvature > 0) | self.path.is_spline
         return np.flatnonzero(segments[self.vertices] | segments[self.vertices + 1])
 
@@ -77,7 +77,7 @@ class _Corners(NamedTuple):
         return p0, n0, k0, p1, n1, k1
 
     def blends(self, remaining: Array) -> Array:
-        """Return the coefficients of blends with given distances from vertex to blend end. Shape (V, 6, 3)."""
+        """Return the coefficients of blends for given distances from vertex to blend end. Shape (V, 6, 3)."""
         p0, n0, k0, p1, n1, k1 = self.ends(remaining)
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
@@ -92,11 +92,10 @@ class _Corners(NamedTuple):
         return self._replace(shape=shape)
 
 
-def _remaining_distances(
+def _size_blends(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with the best shape factors if `free`, and the distance from each vertex to its blend's ends,
-    m.
+    """Return the corners, with best shape factors if `free`, and the distances (m) from vertices to blend ends.
 
     Other arguments as for `smooth`.
     """
@@ -119,7 +118,7 @@ def _remaining_distances(
 
 
 def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Return the largest distances from vertex to blend end, (V,), m, for which each blend is within tolerance."""
+    """Return the largest distances from vertex to blend end, (V,), m, for which each blend is within its tolerance."""
     path = corners.path
     # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
@@ -241,7 +240,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 
 
 def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
-    """Return the largest distance from a blend to the points of the path that the blend replaces. Shape (V,), m."""
+    """Return, for each of V blends, the largest distance of the replaced path points from the blend. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
     for first in range(0, len(remaining), SETTINGS.block):
@@ -268,7 +267,7 @@ def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
 
 
 def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
-    """Return how far points (V, S, 3) of blends are from the closer of the two path parts that the blend replaces."""
+    """Return distances of points (V, S, 3) of V blends from the closer of the two path parts that a blend replaces."""
     return np.minimum(
         _distance_to_segment(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
         _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining),
@@ -276,7 +275,7 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances (V, S), m, of points (V, S, 3) from V parts of segments, from `first` to `last`, m."""
+    """Return the distances, (V, S), m, of points (V, S, 3) from V segment parts from `first` to `last` (m)."""
     spatial = (path.torsion[index] != 0) | path.is_spline[index]
     if spatial.any():
         result = np.empty(points.shape[:2])
@@ -366,7 +365,7 @@ def smooth(
     angles = path.corner_angles()
     factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)
     corners = _Corners(path, kind, factors, np.arange(count - 1))
-    corners, distances = _remaining_distances(corners, remaining, deviation, overlap, free)
+    corners, distances = _size_blends(corners, remaining, deviation, overlap, free)
     blends = corners.blends(distances)
     padded = np.concatenate([[0.0], distances, [0.0]])
     rests = path.lengths - padded[:-1] - padded[1:]

@@ -71,12 +71,12 @@ class Line:
 
     @property
     def normal(self) -> Array:
-        """Zero vector, because a line has no normal. Shape (3,)."""
+        """Zero vector, because a line has no unique normal. Shape (3,)."""
         return np.zeros(3)
 
 
 class _Circular:
-    """Geometry of a helix with start, center, axis, sweep and rise; an arc has no rise."""
+    """Common geometry of arcs and helices: start, center, axis, sweep and, for a helix, rise."""
 
     start: ArrayInput
     center: ArrayInput
@@ -96,23 +96,23 @@ class _Circular:
 
     @property
     def length(self) -> float:
-        """Arc length, m."""
+        """Arc length of the arc or helix, m."""
         return float(np.hypot(self.radius * self.sweep, self.rise))
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the arc or helix at its start. Shape (3,)."""
         tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
         return np.asarray((tangential + self.rise * self.axis) / self.length)
 
     @property
     def curvature(self) -> float:
-        """Curvature, 1/m."""
+        """Constant curvature of the arc or helix, 1/m."""
         return self.radius * (self.sweep / self.length) ** 2
 
     @property
     def torsion(self) -> float:
-        """Torsion, 1/m; positive for a right-handed helix, zero for an arc."""
+        """Constant torsion of the arc or helix, 1/m: positive for a right-handed helix, zero for an arc."""
         return self.rise * self.sweep / self.length**2
 
     @property
@@ -185,7 +185,7 @@ class Arc(_Circular):
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
-        """Return the arc from `start` over `via` to `end`. Shape (3,) each, m.
+        """Return the circular arc from `start` through `via` to `end`. Shape (3,) each, m.
 
         Raises:
             ModelError: Points coincide or are collinear.
@@ -255,7 +255,7 @@ def screw(
     torsion: float | Array,
     distance: float | Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the point at a distance along a line, arc or helix, and three derivatives with respect to the distance.
+    """Return the point at a distance along a line, arc or helix, and its first three derivatives by the distance.
 
     Args:
         start, tangent, normal: Point, unit tangent and unit normal at distance 0. Shape (..., 3), m and unit vectors.
@@ -279,8 +279,8 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return axial and tangential part of the tangent, vector towards the screw axis, (..., 3) each, and rotation rate,
-    rad/m.
+    """Return the axial and tangential parts of a helix's tangent, the vector towards its axis, (..., 3) each, and its
+    rotation rate, rad/m.
 
     Arguments as for `screw`.
     """

@@ -1,4 +1,4 @@
-"""Paths with rounded corners as functions of the distance along the path, in numpy and as casadi Functions.
+"""Paths with rounded corners as functions of the distance along the path, in NumPy and as CasADi Functions.
 
 On each piece of a path, a blend or what remains of a segment, the tool orientation is q(s) = reference exp(theta(s)),
 where the rotation vector theta is a polynomial of the distance s. For a segment that turns at a constant rate about a
@@ -185,7 +185,7 @@ class SmoothPath:
         return _in_blocks(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
-        """Return tool orientation and its rates at given distances from the start of the path, shape (M,), m.
+        """Return tool orientation, and its derivatives by distance, at distances from the path's start, shape (M,), m.
 
         Orientation, rate and acceleration are continuous.
         """
@@ -196,7 +196,7 @@ class SmoothPath:
         return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """Return the curve parameter u at each distance from the start, nan on lines, arcs and helices. Shape (M,)."""
+        """Return the curve parameter u at each distance along the path, nan on lines, arcs and helices. Shape (M,)."""
         s = self.checked_distance(distance)
         u, curved = np.full(len(s), np.nan), self.piece_curve[self._piece(s)] >= 0
         u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
@@ -285,7 +285,7 @@ class SmoothPath:
         return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
-        """Return points of segments and derivatives, at distances from the end of the blend before each segment."""
+        """Return points of segments, and their derivatives, at distances from the end of the preceding blend."""
         start_offset = np.concatenate([[0.0], self.remaining])[segment]
         return self.path.at(segment, start_offset + distance)
 
@@ -331,7 +331,7 @@ class SmoothPath:
 
 
 def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
-    """Evaluate a function at many distances in blocks, to bound the memory. Shapes (M,) to (M, width)."""
+    """Evaluate a function at many distances in blocks, to limit memory use. Shapes (M,) -> (M, width)."""
     results = [np.empty((len(s), width)) for width in widths]
     for first in range(0, len(s), BLOCK_SIZE):
         part = slice(first, first + BLOCK_SIZE)
@@ -341,13 +341,13 @@ def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths:
 
 
 def path_function(path: SmoothPath) -> Any:
-    """Return the casadi Function that evaluates position, tangent and curvature of a path at a distance (m) along it.
+    """Return the CasADi Function that evaluates position, tangent and curvature of a path at a distance (m) along it.
 
     Outputs: position (3, m), tangent (3), curvature vector (3, 1/m), its derivative (3, 1/m^2). It is an MX function
     with the tables of the path in it, which computes the same as `SmoothPath.at`; distances outside the path are
-    clamped to it. casadi differentiates inside a cell only.
+    clamped to it. CasADi differentiates inside a cell only.
     """
-    knots, columns = _cell_table(require.instance("path_function: path", path, SmoothPath))
+    knots, columns = _part_table(require.instance("path_function: path", path, SmoothPath))
     s = ca.MX.sym("distance")
     clamped = _clamp(s, path.length)
     outputs = _cell_function()(_column_at(knots, columns, clamped), clamped)
@@ -355,7 +355,7 @@ def path_function(path: SmoothPath) -> Any:
 
 
 def turn_function(path: SmoothPath) -> Any:
-    """Return the casadi Function that evaluates tool orientation and its rates at a distance (m) along a path.
+    """Return the CasADi Function that evaluates tool orientation and its derivatives at a distance (m) along a path.
 
     Outputs as `SmoothPath.turn`: quaternion (4), rate, acceleration, jerk (3 each, rad/m, rad/m^2, rad/m^3).
     """
@@ -369,7 +369,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the column of a table for the interval between knots in which a distance lies (binary search).
+    """Return the table column of the interval between knots in which a distance lies, found by binary search.
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -431,8 +431,8 @@ def _cell_function() -> Any:
     return ca.Function("in_cell", [row, s], ca.cse(outputs))
 
 
-def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the distances at which parts of the path start, followed by its length, and a data column for each part.
+def _part_table(path: SmoothPath) -> tuple[Array, Array]:
+    """Return the distances at which the parts of a path start, then its length, and a column of each part's geometry.
 
     A part is what remains of a line, arc or helix, or a cell of a curve. A segment has its start point, the axial,
     tangential and inward vectors of its screw, and its rotation rate; a curve its coefficients. Both have distance,
@@ -461,7 +461,7 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def exponential(vector: Any) -> Any:
-    """Return the unit quaternion of a rotation vector (rad), up to 2 pi, as a casadi expression. Shape (4, 1).
+    """Return the unit quaternion of a rotation vector (rad), up to 2 pi, as a CasADi expression. Shape (4, 1).
 
     A power series in the squared angle, smooth at zero.
     """
@@ -476,7 +476,7 @@ def exponential(vector: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Return the casadi Function that evaluates the tool orientation and its rates on one segment or blend of a path.
+    """Return the CasADi Function that evaluates tool orientation and its derivatives on one segment or blend of a path.
 
     Inputs: reference (4); theta (3, 6) as 18 entries column by column; length (m); distance over length. Outputs as
     `turn_function`.

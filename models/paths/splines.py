@@ -98,7 +98,7 @@ class Spline:
 
     @property
     def normal(self) -> Array:
-        """Zero vector in place of a normal, because the curvature of a spline varies. Shape (3,)."""
+        """Zero vector, since points of a spline, unlike those of an arc, are computed without a normal. Shape (3,)."""
         return np.zeros(3)
 
     @cached_property
@@ -113,9 +113,7 @@ class Spline:
         return np.concatenate([[0.0], np.cumsum(np.bincount(self.cells.curve, self.cells.length))])
 
     def parameters(self, distance: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return the piece of the spline at each distance (m) from its start, and the parameter u in it. Shape (M,)
-        each.
-        """
+        """Return the index of the spline's piece, and the parameter u in it, at each distance (m). Shape (M,) each."""
         begins = np.cumsum(self.cells.length) - self.cells.length
         at = np.clip(np.searchsorted(begins, distance, side="right") - 1, 0, len(begins) - 1)
         return parameter(np.asarray(self.coefficients), self.cells, at, distance - begins[at])
@@ -163,7 +161,7 @@ class Spline:
 
 
 class SplineTable(NamedTuple):
-    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once."""
+    """Table that locates distances on all splines of a path, to evaluate points of many splines at once."""
 
     curves: Array  # polynomial that each cell is a part of. Shape (C, 6, 3), m.
     cells: Cells  # the cells, each with a curve of its own
@@ -173,7 +171,7 @@ class SplineTable(NamedTuple):
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
-        """Return the table of the splines among the segments of a path, which begin at given distances, m."""
+        """Return the table that locates distances on a path's splines, from its segments and where these begin (m)."""
         splines = [(each, begin) for each, begin in zip(segments, begins, strict=True) if isinstance(each, Spline)]
         counts = [len(each.cells.curve) if isinstance(each, Spline) else 0 for each in segments]
         curves = np.concatenate([np.asarray(each.coefficients)[each.cells.curve] for each, _ in splines])
@@ -183,7 +181,7 @@ class SplineTable(NamedTuple):
         return cls(curves, Cells(np.arange(len(curves)), *columns), np.concatenate(cell_begins), first, begins)
 
     def at(self, index: NDArray[np.intp], distance: Array) -> tuple[Array, Array, Array, Array]:
-        """Return points at distances (m) along splines, and three derivatives. Shapes (M,) to (M, 3)."""
+        """Return points at distances (m) along splines, and their first three derivatives. Shapes (M,) -> (M, 3)."""
         place = self.begins[index] + distance
         cell = np.searchsorted(self.cell_begins, place, side="right") - 1
         cell = np.clip(cell, self.first[index], self.first[index + 1] - 1)
@@ -192,7 +190,7 @@ class SplineTable(NamedTuple):
 
 
 def _between(coefficients: Array, first: Array, last: Array) -> Array:
-    """Return polynomial curves whose parameters 0 to 1 span the part from `first` to `last`. Shape (P, 6, 3)."""
+    """Return polynomial curves rescaled so that u in [0, 1] spans the part from `first` to `last`. Shape (P, 6, 3)."""
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
     matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
@@ -200,7 +198,7 @@ def _between(coefficients: Array, first: Array, last: Array) -> Array:
 
 
 class Polyline(NamedTuple):
-    """Points to fit a spline to, and the tool orientation at the points."""
+    """Polyline to fit a spline to: its points, and the tool orientation at the points."""
 
     points: Array  # shape (N, 3), m; two successive points differ
     quaternions: Array | None = None  # unit, with continuous signs, (N, 4); None: the tool does not turn
@@ -219,7 +217,7 @@ FIT = FitSettings()
 
 
 def fit_spline(line: Polyline, deviation: float, angle: float, max_pieces: int) -> tuple[Spline, float] | None:
-    """Fit a spline to a polyline, exactly at its ends; return it and a bound of its deviation, m, or None.
+    """Fit a spline to a polyline, exactly at the ends; return the spline and a bound of its deviation (m), or None.
 
     Args:
         deviation: Largest distance (m) between points of equal parameter of polyline and spline.
@@ -257,7 +255,7 @@ def _interpolated(x: Array, places: Array, values: Array) -> Array:
 
 
 def _least_squares(x: Array, values: Array, knots: Array) -> scipy.interpolate.BSpline:
-    """Return the B-spline with given knots that is closest to values (M, k) at x (M,) and equal to them at the ends."""
+    """Return the B-spline with given knots that best fits values (M, k) at x (M,) and equals them at both ends."""
     degree, weights = FIT.degree, np.ones(len(x))
     weights[[0, -1]] = FIT.end_weight
     whole = np.concatenate([np.repeat(knots[0], degree), knots, np.repeat(knots[-1], degree)])
@@ -277,7 +275,7 @@ def _pieces(curve: scipy.interpolate.BSpline, knots: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _bernstein() -> Array:
-    """Return the matrix, (6, 6), that maps values at six equidistant points to Bernstein coefficients of degree 5."""
+    """Return the matrix, (6, 6), from a quintic's values at six equidistant points to its Bernstein coefficients."""
     u, k = np.linspace(0, 1, FIT.degree + 1)[:, None], np.arange(FIT.degree + 1)
     return np.linalg.inv(scipy.special.comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
 
@@ -285,7 +283,7 @@ def _bernstein() -> Array:
 def _with_orientation(
     spline: Spline, poses: scipy.interpolate.BSpline, curve: scipy.interpolate.BSpline, knots: Array
 ) -> Spline:
-    """Return a spline with tool orientations that have the values and two derivatives of a B-spline at the knots."""
+    """Return a spline with tool orientations whose values and two derivatives at the knots are those of a B-spline."""
     q, first, second = (poses(knots, order) for order in range(3))
     square = (q * q).sum(axis=1, keepdims=True)
     back = q * [1, -1, -1, -1]
@@ -356,13 +354,13 @@ def _skew(vector: Array) -> Array:
 
 
 def rotate(quaternion: Array, vector: Array) -> Array:
-    """Return vectors rotated by quaternions. Shapes (M, 4), (M, 3) to (M, 3)."""
+    """Return vectors rotated by quaternions. Shapes (M, 4), (M, 3) -> (M, 3)."""
     twist = 2 * np.cross(quaternion[:, 1:], vector)
     return np.asarray(vector + quaternion[:, :1] * twist + np.cross(quaternion[:, 1:], twist))
 
 
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the tool orientation and its rates at M samples on segments and blends of a path.
+    """Return the tool orientation and its derivatives at M samples on segments and blends of a path.
 
     omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and a
     = |theta|, in the axes of the reference. B and C are entire functions of a^2.
@@ -400,7 +398,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return sum over k of (-x)^k / (2 k + start)! and its first two derivatives at x = `square`."""
+    """Return the sum over k of (-x)^k / (2 k + start)! and its first two derivatives at x = `square`."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first
@@ -410,7 +408,7 @@ def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
 
 
 def exponential(vector: Array) -> Array:
-    """Return the unit quaternions of rotation vectors (rad). Shape (..., 3) to (..., 4)."""
+    """Return the unit quaternions of rotation vectors (rad). Shape (..., 3) -> (..., 4)."""
     half = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
     return np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vector], axis=-1)
 

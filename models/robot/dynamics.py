@@ -151,12 +151,12 @@ def external_wrench(
 
 
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
-    """Return a list of wrenches as a tuple; raise ModelError if an entry is no Wrench."""
+    """Return a list of wrenches as a tuple; raise ModelError if an entry is not a `Wrench`."""
     return require.each("dynamics: wrenches", wrenches, Wrench)
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
-    """Return external wrenches as the columns (moment, force, point of application) of a matrix. Shape (9, k)."""
+    """Return k external wrenches as the columns (moment, force, point of application) of a matrix. Shape (9, k)."""
     require.instance("dynamics: robot", robot, Robot)
     columns = []
     for wrench in checked_wrenches(wrenches):
@@ -243,7 +243,7 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return each link's acceleration of the origin minus gravity, (3, 1), and matrix of `_field`, in link axes."""
+    """Return, by link, its origin's acceleration minus gravity and the matrix [alpha x] + [omega x]^2, in link axes."""
     rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -275,7 +275,7 @@ def _motions_in_links(
 
 
 def _field(omega: Expression, alpha: Expression) -> Expression:
-    """Return [alpha x] + [omega x]^2, which maps a body's point to its acceleration relative to the body's origin."""
+    """Return the matrix [alpha x] + [omega x]^2, which maps body points to accelerations relative to the origin."""
     squares = ca.mtimes(omega, omega.T)
     return skew(alpha) + squares - ca.trace(squares) * ca.DM.eye(3)
 
@@ -292,7 +292,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return the angular (about the world's origin) and linear momentum of the bodies for a common twist."""
+        """Return angular (about the world's origin) and linear momentum of the bodies if all have the given twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -341,7 +341,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the matrix, (6, dof), that maps joint rates to momentum, from `frames_and_axes` and `subtree_moments`."""
+    """Return the matrix, (6, dof), that maps joint rates to momentum, from joint axes and `subtree_moments`."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *reduce_to_joint_vector(robot, momenta))

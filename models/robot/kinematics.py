@@ -113,12 +113,12 @@ def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None =
 
 
 def tip_pose(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Frame:
-    """Return the frame of the tip in the world."""
+    """Return the pose of the tip frame in the world."""
     return tip_frame(robot, link_frames(robot, q, world_from_base))
 
 
 def tip_frame(robot: Robot, frames: dict[str, Frame]) -> Frame:
-    """Return the frame of the tip in the world from the frames of the links."""
+    """Return the pose of the tip frame in the world, computed from the frames of the links."""
     link = frames[robot.tip_link]
     return Frame(ca.mtimes(link.rotation, constant(robot.tip_rotation)), link.point(robot.tip_translation))
 
@@ -146,8 +146,7 @@ def frame_jacobian(
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the matrix, (6, dof), that maps joint rates to (angular, linear) velocity of a link's point, in world
-    axes.
+    """Return the matrix, (6, dof), from joint rates to the (angular, linear) velocity of a link's point, in world axes.
 
     Columns of joints that do not carry the link are zero.
 
@@ -176,7 +175,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the geometric Jacobian, (6, dof), of a link's point in world axes from the axes of `frames_and_axes`."""
+    """Return the geometric Jacobian, (6, dof), of a link's point in world axes, computed from `frames_and_axes`."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -210,7 +209,7 @@ def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Return, by name, the frames of all links in the world and the twist of each moving joint per unit of its rate.
+    """Return, by name, the frames of all links in the world and the twist of each moving joint at unit joint rate.
 
     Twists are (angular velocity, velocity at the world's origin), world axes. Mimic joints are included.
     """
@@ -244,7 +243,7 @@ def frames_and_axes(
 
 
 def constant(array: Array) -> Expression:
-    """Return an array as a sparse DM that omits zeros and rounding residues such as cos(pi / 2)."""
+    """Return an array as a sparse CasADi DM that omits zeros and rounding residues such as cos(pi / 2)."""
     return ca.sparsify(ca.DM(array), 1e-15 * float(np.abs(array).max(initial=0.0)))
 
 
@@ -330,7 +329,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """Return the largest violation of a joint limit: negative inside all limits, -inf without limits. Shape (1, 1)."""
+    """Return the largest violation, (1, 1), of a joint limit: negative inside all limits, -inf without limits."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:
@@ -340,7 +339,7 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """Return sqrt(det(G_r G_r')) of selected rows G_r of a tip Jacobian (Yoshikawa 1985), zero at task singularities.
+    """Return Yoshikawa's manipulability sqrt(det(G G')) of selected rows G of a tip Jacobian, zero at singularities.
 
     Args:
         jacobian: Shape (6, n).

@@ -147,7 +147,7 @@ class _ReducedFile(NamedTuple):
 
 
 def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:
-    """Read an MJCF description, keep only the elements that describe a robot, and note omitted constraints."""
+    """Read an MJCF description, keep only elements that describe a robot, and append omitted parts to `omitted`."""
     tree, origin = parse_file(source, "MJCF")
     if tree.tag != "mujoco":
         hint = "; read URDF with Robot.from_urdf" if tree.tag == "robot" else ""
@@ -204,7 +204,7 @@ def _include(element: ElementTree.Element, folder: Path | None, known: set[Path]
 
 
 def _prune(element: ElementTree.Element, origin: str, depth: int = 0) -> None:
-    """Remove from an MJCF element, at any depth, the elements that are not read, and references to textures."""
+    """Remove from an MJCF element, at any depth, elements that the reader does not use, and references to textures."""
     if depth > INPUT_LIMITS.nesting:
         message = f"{origin} nests elements more than {INPUT_LIMITS.nesting} deep"
         raise ModelError(message, name=origin, value=depth, limit=INPUT_LIMITS.nesting)
@@ -221,7 +221,7 @@ def _is_read(part: ElementTree.Element, parent: str) -> bool:
 
 
 def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
-    """Return MuJoCo's compiled model, in which spheres replace meshes, and each replaced mesh by index of its geom.
+    """Return MuJoCo's compiled model, in which spheres replace meshes, and the replaced meshes, by index of the geom.
 
     The mesh is None for height fields and fitted primitives. Mesh files are opened only if masses follow from them.
     """
@@ -280,7 +280,7 @@ def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any
 def _body_shapes(
     model: Any, meshes: Mapping[int, Any], reduced: _ReducedFile, omitted: list[str]
 ) -> list[dict[str, Any]]:
-    """Return each body's shapes as arguments of `Link`, from the results of `_compile`; note shapes left out."""
+    """Return each body's shapes as arguments of `Link`, from results of `_compile`; add skipped shapes to `omitted`."""
     shapes: list[dict[str, Any]] = [{"collisions": (), "visuals": ()} for _ in range(model.nbody)]
     for k in range(model.ngeom):
         parts = shapes[model.geom_bodyid[k]]
@@ -354,7 +354,7 @@ def _effort(model: Any, j: int) -> float:
 
 
 def _equalities(model: Any, omitted: list[str]) -> tuple[dict[int, Mimic], dict[int, float]]:
-    """Return couplings and locked positions of joints, by joint number; note other constraints in `omitted`."""
+    """Return couplings and locked positions of joints, by joint number; append other constraints to `omitted`."""
     mimics: dict[int, Mimic] = {}
     locked: dict[int, float] = {}
     for k in (k for k in range(model.neq) if model.eq_active0[k]):

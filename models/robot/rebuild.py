@@ -129,7 +129,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Return one robot made of several robots, such as arms, on a common base; its tip is the tip of the first of them.
+    """Return one robot that joins several, such as arms, on a common base; its tip is the tip of the first one.
 
     Args:
         base: A link or a robot that carries the arms.
@@ -176,7 +176,7 @@ def add_prefix(robot: Robot, prefix: str) -> Robot:
 
 
 def reroot(robot: Robot, root: str) -> Robot:
-    """Return the robot with another link as the root of its tree, see `models.robot.tree.reroot_tree`."""
+    """Return the robot with another link as the root of its tree; joints between the two roots are reversed."""
     links, joints = reroot_tree(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 

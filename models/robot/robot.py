@@ -110,7 +110,7 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF text or file; `models.robot.urdf.read_urdf` documents contents and default values.
+        """Read a robot from a URDF text or file; `models.robot.urdf.read_urdf` states what is read and the defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.

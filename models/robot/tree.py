@@ -195,7 +195,7 @@ def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float])
 
 
 def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
-    """Return the joints whose child link is in `kept`; mimics of removed joints are coupled to remaining ones.
+    """Return the joints whose child link is in `kept`; mimics of removed joints are coupled to remaining joints.
 
     Mimics of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
     their leader. So the remaining joints can reach the same positions as before; limits of removed joints are lost.
@@ -280,7 +280,7 @@ def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], join
 
 
 def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
-    """Return a robot's links and joints after replacing or omitting a floating joint, given as the fixed joint `place`.
+    """Return links and joints with `place`, a fixed joint that stands for a floating one, replaced or omitted.
 
     If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
     NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
@@ -306,7 +306,7 @@ def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint
 def _replace_by_chain(
     place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
 ) -> Parts:
-    """Return a robot with one joint replaced by several; `steps` states name suffix, kind and axis of each of these."""
+    """Return a robot with one joint replaced by several; `steps` states each new joint's name suffix, kind and axis."""
     new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
     ends = [place.parent, *(link.name for link in new_links), place.child]
     chain = [

@@ -79,8 +79,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     position limits. The same holds for effort and velocity, and a limit of `UNLIMITED` is none. A floating joint
     between a massless root and its only child means that the robot floats: both are omitted, and the base of
     `FreeFloating` moves in their place. Any other floating or planar joint becomes a chain of joints with one degree of
-    freedom, without limits, see
-    `models.robot.tree`. A <mimic> of a fixed joint is ignored.
+    freedom, without limits, see `models.robot.tree`. A <mimic> of a fixed joint is ignored.
 
     Left out with one warning that names them, as other readers load such files: collision shapes with an edge, radius,
     length or scale of zero; all shapes of a <geometry> but the first; misspelt and unknown attributes, for which the
@@ -301,7 +300,7 @@ def _shape(
     omitted: list[str],
     **arguments: Any,
 ) -> list[_Shape]:
-    """Return a list of the shape of a <collision> or <visual> element; if it has no volume, note it and return []."""
+    """Return a list with the shape of a <collision> or <visual> element; it is empty if the shape has no volume."""
     shapes: list[Any] = list(child_of(element, "geometry", owner))
     if not shapes:
         raise ModelError(f"{owner}: <geometry> has 0 shapes, not one", name="geometry", value=0, limit=1)
@@ -434,7 +433,7 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """Return an attribute of an XML element as one number, possibly inf or nan; raise ModelError if it is no number."""
+    """Return an attribute of an XML element as a number, possibly inf or nan; raise ModelError for other text."""
     return float(numbers_of(element, key, owner, 1, finite=False)[0])
 
 

@@ -35,7 +35,7 @@ MAX_CAPSULE_VOLUME = 1.25
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """A mesh of a link, which one or more collision bodies (capsules or a box) cover."""
+    """A mesh of a link, covered by one or more collision bodies (capsules or a box)."""
 
     points: Array  # vertices in the frame of the link. Shape (n, 3), m.
     number: int = 0  # index of the mesh among the collision shapes of the link
@@ -215,7 +215,7 @@ class RigidParts:
 
     @classmethod
     def of(cls, robot: Robot) -> RigidParts:
-        """Return the rigid parts of a robot."""
+        """Return the rigid parts of a robot, the sets of links that no moving joint separates."""
         parts = cls({robot.root: robot.root}, {robot.root: (np.eye(3), np.zeros(3))}, {})
         for joint in robot.joints:
             rotation, translation = parts.pose[joint.parent]
@@ -229,7 +229,7 @@ class RigidParts:
         return parts
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
-        """Return the joints between two rigid parts: those up to the part that carries both parts, then those down."""
+        """Return the joints between two rigid parts: first those up to the part that carries both, then those down."""
         up, down = self._joints_above(first), self._joints_above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
@@ -249,7 +249,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of rigid parts in `bodied` that have no other part of `bodied` between them in the tree."""
+        """Return the pairs of rigid parts among `bodied` between which no other part of `bodied` lies in the tree."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)

@@ -28,13 +28,13 @@ PARALLEL = 1e-18
 
 
 class SegmentCore(NamedTuple):
-    """The point or segment that forms a ball or capsule if a sphere sweeps along it: one point, or the two ends."""
+    """Point or segment along which a sphere sweeps to form a ball or a capsule: one point, or the two ends."""
 
     points: tuple[Triple, ...]
 
 
 class BoxCore(NamedTuple):
-    """A box in distance formulas, given by its centre, axes and half edge lengths."""
+    """A box as distance formulas use it: its centre, axes and half edge lengths."""
 
     centre: Triple
     axes: tuple[Triple, ...]
@@ -42,7 +42,7 @@ class BoxCore(NamedTuple):
 
 
 def keep_gradient(value: Expression) -> Expression:
-    """Return an expression unchanged; it replaces `StoppedGradients` where differentiation keeps all derivatives."""
+    """Return an expression unchanged; used in place of `StoppedGradients` where all derivatives are needed."""
     return value
 
 
@@ -82,22 +82,20 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a distance from its square; if the square may be too large by `excess`, a lower bound of the distance."""
+    """Return the root of a squared distance or, if this may be too large by `excess`, a lower bound of the distance."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """Return the smaller of a gap and zero, or a smooth lower bound of this value, at most `rounding` / 4 below it."""
+    """Return min(gap, 0) or, with `rounding` > 0, a smooth lower bound that is at most `rounding` / 4 below it."""
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
 
 
 def _positive_part(gap: Expression, rounding: float) -> Expression:
-    """Return a smooth lower bound of the larger of a gap and zero, at most `rounding` / 2 below, zero for negative
-    gaps.
-    """
+    """Return a smooth lower bound of max(gap, 0), at most `rounding` / 2 below it and zero for negative gaps."""
     return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 * (0.5 / rounding)
 
 
@@ -113,7 +111,7 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
 def distance_of_segments(
     first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the distance of two points, a point and a segment, or two segments; it is zero for crossing segments."""
+    """Return the distance of two points, a point and a segment, or two segments, which is zero if segments cross."""
     if len(first.points) < len(second.points):
         first, second = second, first
     p, q = first.points[0], second.points[0]
@@ -232,7 +230,7 @@ def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> E
 def _segment_box_square(
     middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the squared distance of a segment (in the box's axes) from a box, plus a penalty if `weight` > 0.
+    """Return the squared distance of a segment (in the box's axes) from a box, plus `weight` * (offset from middle)^2.
 
     The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
     weight s plus, for each axis, u_k times the excess of x_k over the box, which is zero inside and linear outside. The
@@ -259,7 +257,7 @@ def _segment_box_square(
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return, for each of three components, 1 if its magnitude is the largest relative to its size, else 0."""
+    """Return 1 for that of three components with the largest ratio of magnitude to its entry in `sizes`, else 0."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])

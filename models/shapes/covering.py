@@ -98,7 +98,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
     points = unit.reshape(-1, 3)
     hull = _hull_vertices(points)
     extreme_points = points[_extreme_indices(points, _principal_axes(points))]
-    grid, box_volume = _grid(points)
+    grid, box_volume = _volume_samples(points)
     parts, capsules = [unit], [_fit_capsule(points)]
     choices: list[tuple[float, list[CoverShape]]] = []
     first_volume = first_overhang = 1.0
@@ -156,7 +156,7 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return volume, radius, ends along the axis, axis and a point on the axis of the capsule with given parameters.
+    """Return volume, radius, ends along the axis, axis direction and axis point of the capsule with given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius.
@@ -178,7 +178,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
-    """Return parameters, basis and volume of a small capsule around points; the bases to try have shape (k, 3, 3)."""
+    """Return parameters, basis and volume of the smallest of k capsules around points, one per basis, (k, 3, 3)."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -220,7 +220,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the parts into which a plane splits a mesh with least covered volume; one part if no plane splits it."""
+    """Return the parts into which a plane splits a mesh so that their covers are smallest, or one part if none does."""
     points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
@@ -252,13 +252,13 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
     return [side for side in split_triangles(part, axes[k], level) if len(side)]
 
 
-def _grid(points: Array) -> tuple[Array, float]:
-    """Return evenly spread points, (k, 3), in a box that contains nearly all covers of points, and its volume."""
+def _volume_samples(points: Array) -> tuple[Array, float]:
+    """Return sample points, (k, 3), to estimate volumes of covers of a point set, and the volume of their box."""
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
     shares = (np.arange(1, SETTINGS.grid + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4) + 0.5) % 1
-    wide = 1.5 * np.maximum(high - low, 0.6 * float((high - low).max()))
+    wide = 1.5 * np.maximum(high - low, 0.6 * float((high - low).max()))  # nearly every cover is in the box
     return np.asarray(((low + high) / 2 + (shares - 0.5) * wide) @ frame.T), float(np.prod(wide))
 
 
@@ -270,7 +270,7 @@ def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
 
 
 def _representative_triangles(triangles: Array, frame: Array) -> Array:
-    """Return all triangles or, if they are many, the largest, and extreme vertices as degenerate triangles."""
+    """Return all triangles of a mesh or, if many, the largest ones, and extreme vertices as degenerate triangles."""
     if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
@@ -300,7 +300,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points; a face and an edge lie along a face and edge of the hull."""
+    """Return a box of nearly least volume around points, with a face and an edge along those of their convex hull."""
     frames = [_principal_axes(points)]
     try:
         hull = convex_hull(extreme_points)

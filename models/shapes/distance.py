@@ -48,7 +48,7 @@ from models.spatial import Expression, Frame, expression, on_scalars
 
 
 class HullCore(NamedTuple):
-    """A `Polytope` in distance formulas: a convex hull, with the centre and axes of its pose."""
+    """A `Polytope` as distance formulas use it: a convex hull, with the centre and axes of its pose."""
 
     centre: Triple
     axes: tuple[Triple, ...]
@@ -56,7 +56,7 @@ class HullCore(NamedTuple):
 
 
 class PlaneCore(NamedTuple):
-    """The boundary plane of a half-space in distance formulas, given by a point and the outward normal."""
+    """The boundary plane of a half-space as distance formulas use it: a point and the outward normal."""
 
     point: Triple
     normal: Triple
@@ -143,7 +143,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
 
 
 def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0) -> Any:
-    """Return the CasADi Function that computes the `distance` of two shapes of given kinds from their `column`s.
+    """Return the CasADi Function for the `distance` of two shapes of given kinds, whose inputs are results of `column`.
 
     `pair_function(Capsule, Box).map(n)` evaluates n pairs, side by side as columns. One small function that is called
     often evaluates and compiles several times faster than one graph of all pairs.
@@ -160,7 +160,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from n pairs of shapes to their distances and the distances' gradients, as wrenches.
+    """Return the CasADi Function from n pairs of shapes to their distances and the gradients, as (moment, force).
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
@@ -202,7 +202,7 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
 
 
 class StoppedGradients:
-    """Store of expressions that differentiation treats as constants, since symbols stand for them until restored.
+    """Store of expressions that differentiation treats as constants, because symbols replace them until `restore`.
 
     A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
     (envelope theorem).
@@ -248,7 +248,7 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
 def soft_minima(
     value: Expression, gradient: Expression, positions: list[int], counts: list[int], *, softness: float
 ) -> tuple[Expression, Expression]:
-    """Return the soft minimum of the distances in each group, and its gradient.
+    """Return the smooth minimum of the distances in each group, and the gradient of this minimum.
 
     The distances of the groups, `counts` each, are at the rows `positions` of `value` and `gradient`.
     """
@@ -294,7 +294,7 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one a `Polytope`, at `poses` (rotation and position of each)."""
+    """Return the signed distance of two shapes, one of them a `Polytope`, at `poses` (each a rotation and position)."""
     first_core, second_core = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
     if isinstance(first_core, PlaneCore):
         gap = _least_height(second_core, first_core.normal, first_core.point, rounding)
@@ -332,7 +332,7 @@ def _as_number(entry: Expression) -> Expression:
 
 
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Return the least height of a segment, box or hull above a plane, or a lower bound smoothed over `rounding`."""
+    """Return the least height of a segment, box or hull above a plane or, if `rounding` > 0, a smooth lower bound."""
     if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
@@ -351,7 +351,7 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps between two convex bodies along the first body's face normals; an empty list without faces."""
+    """Return the gaps between two convex bodies along the first body's face normals; empty if it has no faces."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]

@@ -65,14 +65,14 @@ def mesh_error(file: Path, fault: str, value: object = None, limit: object = Non
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Return an iterator over (number from 1, line) of a text file; raise a ModelError if the file is too long."""
+    """Return an iterator over (line number from 1, line) of a text file; raise ModelError if the file is too long."""
     if len(data) > INPUT_LIMITS.mesh_text_bytes:
         raise mesh_error(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
 
 
 def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
-    """Convert words of a line to numbers; raise a ModelError, which names the line, if a word is no number."""
+    """Convert words of a line to numbers; raise a ModelError, which names the line, if a word is not a number."""
     values = []
     for word in words:
         try:
@@ -138,9 +138,7 @@ def _is_file(path: Path) -> bool:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Faces]:
-    """Return the vertices (n, 3), m, all finite and referenced, and triangles (m, 3) of a mesh file; see
-    `read_painted_mesh`.
-    """
+    """Return the vertices, (n, 3), m, and the triangles, (m, 3), of a mesh file, read by `read_painted_mesh`."""
     vertices, faces, _ = read_painted_mesh(path)
     return vertices, faces
 
@@ -238,7 +236,7 @@ def _merge_vertices(corners: Array) -> Triangles:
 
 
 def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index of each distinct row of a table, in ascending order of rows, and each row's number among them.
+    """Return the indices of the distinct rows of a table in sorted order, and each row's number among these rows.
 
     Several times faster than `np.unique` with an axis.
     """
@@ -417,7 +415,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances of nodes in a Collada document by the nodes; raise ModelError if these become too many."""
+    """Replace node instances in a Collada document by copies of the nodes; raise ModelError if these are too many."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 
@@ -443,9 +441,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a Collada document with only the materials of a given one and their diffuse colours, opaque and without
-    images.
-    """
+    """Return a reduced Collada document: only materials and their diffuse colours, opaque and without images."""
     root = ElementTree.Element("COLLADA")
     effects = {each.get("id"): each for each in document.iter("effect")}
     libraries = [ElementTree.SubElement(root, f"library_{kind}") for kind in ("effects", "materials")]

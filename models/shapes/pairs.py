@@ -230,7 +230,7 @@ Poses: TypeAlias = tuple[Array, Array]
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies, with its entry in the joint vector."""
+    """A moving joint between two bodies: its entry in the joint vector, and the lever arm of one of the bodies."""
 
     column: int  # index in the joint vector
     ratio: float  # velocity of the joint over that of the entry
@@ -256,7 +256,7 @@ class _PairClassifier:
     _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why two bodies need no check, or None; and whether only covers, not hulls, of meshes always collide.
+        """Return why two bodies need no check, or None, and whether hulls of meshes replace covers that always collide.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -324,7 +324,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_separation(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER if two hulls are disjoint on ever finer joint grids, ALWAYS if they overlap on the first."""
+        """Return NEVER if two hulls are disjoint on ever finer joint grids, ALWAYS if they overlap on a whole grid."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         start = np.where(np.isfinite(low), low, -np.pi)[columns]
         end = np.minimum(np.where(np.isfinite(high), high, np.pi)[columns], start + 2 * np.pi)
@@ -343,9 +343,9 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds, m, of the distance at joint vectors (k, dof), and a mask where balls do not suffice.
+        """Return lower bounds, m, of the distance at joint vectors (k, dof), and at which the bounding balls are close.
 
-        Bounding balls suffice where they prove a distance greater than `above`, m.
+        They are close where they do not prove a distance greater than `above`, m. The shapes then give the bound.
         """
         (turn, shift), first, second = self._relative(q), self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
@@ -355,7 +355,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds, m, of the distance for poses of the second body, exact if the search converges."""
+        """Return lower bounds, m, of the distance at given poses of the second body, exact if the search converges."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (

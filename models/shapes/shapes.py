@@ -49,7 +49,7 @@ class _SweptCore:
         return 0.0
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
+        """Return the shape in a new frame, given the rotation (3, 3) and translation (3,), m, of its present frame."""
         turn = require.rotation("shape: rotation", rotation)
         shift = require.array("shape: translation", translation, (3,))
         own = copy(self)  # shares the hull, which is costly to compute
@@ -65,7 +65,7 @@ class _SweptCore:
 
 
 class Polytope(_SweptCore):
-    """A shape that distances represent by its `hull`, a convex polytope at a pose of its own."""
+    """A shape that distance computations replace by its `hull`, a convex polytope with a pose of its own."""
 
     AXES: ClassVar[tuple[str, ...]] = ("rotation",)
     position: ArrayInput
@@ -166,7 +166,7 @@ class Cylinder(Polytope):
 
     @cached_property
     def hull(self) -> Hull:
-        """The prism that represents the cylinder, in the axes of the cylinder."""
+        """The prism that replaces the cylinder in the computation of distances, in the axes of the cylinder."""
         angles = 2 * pi / SIDES * (np.arange(SIDES) + 0.5)
         around = self.radius / cos(pi / SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
         half = np.full((SIDES, 1), self.length / 2)
@@ -175,7 +175,7 @@ class Cylinder(Polytope):
 
 @dataclass(frozen=True, eq=False)
 class Box(_SweptCore):
-    """A solid box at a pose of its own, whose edges may be infinite.
+    """A solid box with a pose of its own and edges that may be infinite.
 
     Attributes:
         size: Full length of the edges. Shape (3,), m; inf along an axis without ends, as for walls of a wind tunnel.
@@ -203,9 +203,7 @@ class Box(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Corners of the box, ordered along the z edge first, then y, then x; ModelError for an infinite edge. Shape
-        (8, 3), m.
-        """
+        """Corners of the box, (8, 3), m, with z varying fastest and x slowest; ModelError for an infinite edge."""
         size = require.array("box: size", self.size, (3,), unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 
@@ -325,7 +323,7 @@ def checked_shape(label: str, value: Any) -> Shape:
 
 
 def enlarge_shape(shape: Shape, by: float) -> Shape:
-    """Return a shape of the same kind that contains all points within a distance (m) of a shape.
+    """Return a shape of the same kind that contains all points within a distance (m) of the given shape.
 
     Raises:
         ModelError: The shape is a mesh.

@@ -26,7 +26,7 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, RESOLVED_SHAR
 
 
 class AccessoryProblem:
-    """Linear-quadratic problem of the second variation of the cost: dynamics, Hamiltonian and active constraints.
+    """Linear-quadratic (accessory) problem of the second variation of the cost along a plan.
 
     It is stated at the Gauss points. z = (state x, horizon T if free, start x0 if the end conditions contain it); the
     independent variable is the fraction s of the horizon.
@@ -63,7 +63,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose scales of the variables that make the backward sweep well conditioned; results do not depend on them.
+        """Choose scales of the variables that make the backward sweep well conditioned and do not affect the results.
 
         Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
         Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
@@ -121,7 +121,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Residual of dH/du = 0, times horizon, for scaled controls; 0 for linear controls. Shape (M, nu)."""
+        """Gradient of horizon times augmented Hamiltonian in scaled controls; 0 if linear in them. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -129,14 +129,14 @@ class AccessoryProblem:
 
     @property
     def start_slope(self) -> np.ndarray:
-        """Gradient of the cost with respect to start state and horizon, in scaled variables. Shape (nz,)."""
+        """Gradient of the cost with respect to the scaled start state and horizon. Shape (nz,)."""
         gradient, nx = self.adjoint.ends.slope, self.nx
         slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.with_start)])
         return np.asarray(slope * self.unit[: self.nz])
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian, in cost units, if variables change by their characteristic sizes."""
+        """Integrated second-order change of the Hamiltonian if states and controls change by characteristic sizes."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
@@ -157,7 +157,7 @@ class AccessoryProblem:
 
     @property
     def control_scale(self) -> float:
-        """Second-order change of the cost if every control is doubled (changed by its own value), in units of cost."""
+        """Second-order change of the cost for variations of the controls that equal the controls themselves."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
@@ -206,7 +206,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find controls that switch between limits inside an interval, and the cost's curvature in switching times."""
+        """Find controls that switch between limits inside an interval, and the cost's curvature in the switch times."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -253,10 +253,10 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the Hessian and active gradients of a plan's end constraints, then those of its start constraints.
+    """Return the Hessian of the Lagrangian and the gradients of active constraints at a plan's end, then at its start.
 
-    They refer to the scaled variations z. Inequalities are active if they have multipliers, state bounds if the plan
-    rests on them.
+    The Lagrangian is the terminal cost plus multipliers times constraints. All refer to the scaled variations z.
+    Inequalities are active if they have multipliers, state bounds if the plan rests on them.
     """
     along, ends = accessory.along, accessory.adjoint.ends
     form, solution, (low, high) = along.form, along.solution, along.bounds

@@ -39,7 +39,7 @@ COST_LOST = "cost lost, relative"
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check of an audit: the deviation found and the largest allowed deviation.
+    """Result of one check of an audit: the deviation of the plan and the largest allowed deviation.
 
     Attributes:
         name: What is checked.
@@ -67,7 +67,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Audit:
-    """Result of the audit of a plan: the findings of all checks, and the quantities computed for them.
+    """Result of the audit of a plan: the findings of all checks, and the quantities computed for the checks.
 
     Attributes:
         name: Name of the problem.
@@ -191,7 +191,7 @@ def audit(
     tolerances: Mapping[str, float] | None = None,
     only_feasible: bool = False,
 ) -> Audit:
-    """Check a plan independently of the solver that made it.
+    """Check a plan for feasibility and local optimality, independently of the solver that computed it.
 
     Tolerances are relative to sizes along the plan (:class:`ocp.audit.sizes.Sizes`): the spread of a quantity and, for
     a constraint, its change with the quantities it depends on. Scaling anything by a power of ten, or moving its
@@ -349,7 +349,7 @@ def clearance_finding(clearance: Clearance, limit: float) -> Finding:
 
 
 def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) -> Finding:
-    """Return the finding about the relative deviation of a plan from its states re-integrated over the horizon."""
+    """Return the finding about the deviation of a plan's states from those re-integrated under its controls."""
     notes = [] if motion.breakdown_time is None else [f"the integration broke down at {motion.breakdown_time:.6g} s"]
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
@@ -358,7 +358,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the finding on the largest violation of a constraint, relative to its size or within a `tolerance`."""
+    """Return a finding that compares a constraint's largest violation with `tolerance` or a share of its magnitude."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
@@ -376,7 +376,7 @@ def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None
 
 
 def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
-    """Return the finding about the difference of a plan's reported cost from that of the re-integrated plan."""
+    """Return the finding about the difference between the reported cost of a plan and the re-integrated cost."""
     cost = running + final
     size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
     error = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
@@ -384,7 +384,7 @@ def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes
 
 
 def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
-    """Return the finding about the largest difference of a plan's reported samples from its interpolants.
+    """Return the finding about the largest difference between the samples that a plan reports and its interpolants.
 
     It is relative to the sizes. At a break of an interpolant the values of either side count.
     """

@@ -36,7 +36,7 @@ MAX_PRINTED = 4
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Resolution and limits of the bisection of time intervals that bounds the distances between bodies.
+    """Settings of the bisection of time intervals that bounds the distances between bodies.
 
     Attributes:
         share: Relative accuracy of the difference between the smallest and the required distance.
@@ -57,7 +57,7 @@ class ProofSettings:
 
 @dataclass(frozen=True)
 class ClosestPair:
-    """The closest approach of two bodies.
+    """The closest approach of two bodies during a motion.
 
     Attributes:
         bodies: Names of the two bodies.
@@ -110,7 +110,7 @@ class Track(NamedTuple):
 
 @dataclass(frozen=True)
 class Clearance:
-    """Result of a verification of clearances: bounds of the distances between the bodies of each pair along a motion.
+    """Result of a proof of clearance: bounds of the distances between the bodies of each pair along a motion.
 
     Attributes:
         name: Name of the separation.
@@ -147,7 +147,7 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """List of one text about the pairs of bodies that are left out by assumption; empty if there are none."""
+        """Text, in a list, on the pairs of bodies that are left out by assumption; an empty list if there are none."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
@@ -229,9 +229,9 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return the separation constraints whose state names end with a suffix, each with the motion of its bodies.
+    """Return the separation constraints of one part of a plan, each with the motion of its bodies.
 
-    Those without pairs of bodies are left out.
+    The states of the part have names that end with `suffix`. Constraints without pairs of bodies are left out.
     """
     form = Formulation.of(problem)
     check_variables_match(form, solution)
@@ -323,7 +323,7 @@ class _Search:
         return self._closest(self.best)
 
     def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
-        """Return, for each pair, the closest approach found so far, with a given lower bound of the distance.
+        """Return, for each pair, the closest approach found so far, together with a given lower bound of the distance.
 
         ``bounds`` are the lower bounds, m. Shape (n,).
         """
@@ -369,7 +369,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of distances in time intervals (K,), and the sufficient bounds of all pairs (n,), m.
+        """Return lower bounds of distances, m, in K time intervals, and for n pairs the bounds that end bisection.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.

@@ -70,7 +70,7 @@ both estimates the error."""
 
 
 class IntegratedMotion(NamedTuple):
-    """States and running cost that the controls of a plan produce, on the fine grid of the plan.
+    """States and running cost that follow from the controls of a plan, on the fine grid of the plan.
 
     Attributes:
         local: States integrated over each interval from the plan's own state at its start. Shape (N, cells + 1, nx).
@@ -85,7 +85,7 @@ class IntegratedMotion(NamedTuple):
 
 
 def corrected_motion(along: Linearisation) -> IntegratedMotion | None:
-    """Return the motion that the controls of a plan produce; None if the corrections of its states do not converge."""
+    """Return the motion under the controls of a plan, by Newton corrections of its states; None without convergence."""
     if not along.finite:
         return None
     newton = _Newton(along)
@@ -107,7 +107,7 @@ class _Converged(NamedTuple):
 
 
 class _Newton:
-    """Newton's method for the motion that the controls of a plan produce, on the fine grid of the plan."""
+    """Newton's method that corrects the states of a plan, on its fine grid, to the motion under its controls."""
 
     def __init__(self, along: Linearisation) -> None:
         self.along, form, grid = along, along.form, along.grid
@@ -198,7 +198,7 @@ class _Newton:
         return float(np.einsum("k,j,kji,kji->", along.width, along.weight, slope, self.at_gauss @ change))
 
     def _own_error(self, integral: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the first-order error of states ``x`` that arises within each interval, not in earlier intervals."""
+        """Return the first-order error of states ``x`` that arises inside each interval, not in earlier intervals."""
         (n, q), nx = self.along.shape, self.along.form.nx
         defect = integral[..., :nx] - (x - x[:, :1])
         at_gauss = self.at_gauss @ defect
@@ -210,7 +210,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate state errors at the interval ends, ``ends`` (N, nx), and jumps of ``x`` through later intervals."""
+        """Propagate errors ``ends`` (N, nx) of intervals and jumps of ``x`` between them by the linearised dynamics."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):

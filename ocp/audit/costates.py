@@ -44,7 +44,7 @@ class Ends(NamedTuple):
 
 @dataclass(frozen=True)
 class Adjoint:
-    """Costates and multipliers of a plan, with the errors of their equations in units of cost.
+    """Costates and multipliers of a plan, with the errors of their equations in units of the cost.
 
     Attributes:
         t: Ends of the intervals, s. Shape (N + 1,).
@@ -235,7 +235,7 @@ class BackwardIntegration:
 def _state_limit_multipliers(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the state limits in mesh interval ``k`` that best explain the reported costates.
+    """Return the multipliers of state limits in mesh interval ``k`` that best explain the reported costates.
 
     Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
     """
@@ -308,7 +308,7 @@ def _ends(
     cost: float,
     lam1: np.ndarray,
 ) -> Ends:
-    """Return the residuals of the optimality conditions at both ends, with fitted multipliers of admissible sign."""
+    """Return the residuals of the optimality conditions at both ends of a plan, with multipliers of admissible sign."""
     form, nx = along.form, along.form.nx
     lam0 = interval_end_costates(along)[0][0]
     gradient = along.final_y
@@ -360,16 +360,16 @@ class EndLimits:
 
     @property
     def reach(self) -> np.ndarray:
-        """First-order cost change per unit multiplier if states and horizon change by their sizes. Shape (K,)."""
+        """Change of each limited quantity if states and horizon change by their typical sizes. Shape (K,)."""
         return np.asarray(np.abs(self.slope) @ self.unit)
 
     @property
     def scaled_slope(self) -> np.ndarray:
-        """Signed gradient of each limit in the scaled x, x0 and T, divided by `reach`. Shape (K, 2 nx + 1)."""
+        """Gradients of limits towards violation in scaled states and horizon, with 1-norm 1. Shape (K, 2 nx + 1)."""
         return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the signed multipliers of the end constraints and of the start constraints."""
+        """Return the signed multipliers of end and of start constraints, from the multipliers of all K limits."""
         values = np.zeros(sum(self.rows))
         is_row = self.row >= 0
         np.add.at(values, self.row[is_row], (self.sign * multipliers)[is_row])

@@ -37,7 +37,7 @@ FULL_RANK = RankTolerances(ROUNDING_SHARE, ROUNDING_SHARE)
 
 @dataclass(frozen=True)
 class Curvature:
-    """The second variation of the cost along a plan.
+    """Result of the analysis of the second variation of the cost along a plan.
 
     Attributes:
         least: Smallest curvature of the cost over the feasible variations of a stage, including the optimal response of
@@ -165,7 +165,7 @@ def _sweep(
                 if smallest < -FLAT_SHARE * scale:
                     if reason := _singular(accessory, k, worst):
                         return Curvature(least, time, reason, None, t)
-                    return _negative(accessory, sweep, gains, (least, time), first=k, controls=worst)
+                    return _confirmed_negative(accessory, sweep, gains, (least, time), first=k, controls=worst)
                 label = _label(accessory.along.form, worst, nu)
                 flat = f"the cost does not curve along control {label!r} at {mesh[k] * horizon:.4g} s"
                 inconclusive, curved = inconclusive or flat, values > FLAT_SHARE * scale
@@ -183,7 +183,7 @@ def _sweep(
         if values[0] / scale < least:
             least, time = float(values[0] / scale), 0.0
         if values[0] < -FLAT_SHARE * scale:
-            return _negative(accessory, sweep, gains, (least, time), start=basis @ vectors[:, 0])
+            return _confirmed_negative(accessory, sweep, gains, (least, time), start=basis @ vectors[:, 0])
         if values[0] <= FLAT_SHARE * scale:
             inconclusive = inconclusive or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT_SHARE * scale, values, 0.0)
@@ -191,7 +191,7 @@ def _sweep(
 
 
 class _Linearised(NamedTuple):
-    """Linearised problem of every stage (mesh interval) as a function of variations of the stage's start and controls.
+    """Linearised problem of all stages (mesh intervals) as a function of variations of their starts and controls.
 
     Attributes:
         whole: Variations of (z, u) at the Gauss points. Shape (N, q, nz + nu, nz + q nu).
@@ -214,7 +214,7 @@ class _Linearised(NamedTuple):
 
     @classmethod
     def of(cls, accessory: AccessoryProblem) -> _Linearised:
-        """Express the variations at all Gauss points by the variations of the interval starts and of the controls."""
+        """Express the variations at the Gauss points by the variations of the interval starts and of the controls."""
         along, nz, nu = accessory.along, accessory.nz, accessory.nu
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
@@ -254,7 +254,7 @@ class _Linearised(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """One stage (mesh interval) of the sweep, reduced to the f control variations that its own constraints leave free.
+    """One stage (mesh interval) of the sweep, reduced to those f control variations that its constraints leave free.
 
     Attributes:
         lift: (z, 1, controls) as a function of (z, 1) and the free variations. Shape (nz + 1 + q nu, nz + 1 + f).
@@ -304,7 +304,7 @@ def _reduce_stages(
 def _eliminate_controls(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate the controls that linear constraints, ``rows`` (K, r, nz + m), determine in K stages of m controls.
+    """Eliminate the controls that linear constraints ``rows`` (K, r, nz + m) determine in K stages of m controls.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -353,11 +353,11 @@ def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale the gradients of end conditions to length 1, so that conditions on states that hardly change count."""
+    """Scale the gradients of end conditions to length 1, so that conditions on almost constant states count as well."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
-def _negative(
+def _confirmed_negative(
     accessory: AccessoryProblem,
     sweep: _Linearised,
     gains: list[_Gain],
@@ -367,7 +367,7 @@ def _negative(
     controls: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> Curvature:
-    """Return the result of a sweep with negative curvature, which counts only if an admissible variation confirms it.
+    """Return the result of a backward sweep with negative curvature, undetermined if no admissible variation has it.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.

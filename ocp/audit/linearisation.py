@@ -28,7 +28,7 @@ MAX_DERIVATIVES = 3
 
 
 class Limits:
-    """Lower and upper limits of quantities at points of a plan: distances to them, and masks of possibly active limits.
+    """Lower and upper limits of quantities along a plan: the distances to them, and which of them may be active.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -66,7 +66,7 @@ class Limits:
         return part
 
     def extend(self, count: int) -> None:
-        """Append `count` equality constraints that the plan satisfies exactly."""
+        """Append `count` equality constraints, which the plan satisfies exactly, to these limits."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
@@ -80,17 +80,17 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """Mask of possibly active limits (equalities once), distances to them, and sign: upper, then lower limits."""
+        """Mask of possible activity, distances, multiplier sign of upper limits and equalities, then of lower ones."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the complementarity products: absolute multipliers times distances to the limits. Shape (M, m)."""
+        """Return the complementarity products, absolute multipliers times distances to the limits. Shape (M, m)."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
 
 class Linearisation:
-    """First derivatives of cost, dynamics and constraints along a plan, at Gauss points of its intervals.
+    """First derivatives of cost, dynamics and constraints along a plan, at Gauss points of the mesh intervals.
 
     Attributes:
         p, bounds: Parameters, shape (np,), and the bounds of the problem at these.
@@ -179,7 +179,7 @@ class Linearisation:
 
     @property
     def may_be_degenerate(self) -> bool:
-        """Whether inequalities may be active. The multipliers of the plan are then not necessarily unique."""
+        """Whether some inequalities may be active, so that the multipliers of the plan need not be unique."""
         sides = (self.control_limits, self.state_limits, self.node_limits)
         return any(bool(limits.near[:, ~limits.equal].any()) for limits in sides)
 
@@ -296,7 +296,7 @@ class Linearisation:
         self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
-        """Add limits of the controls that state equalities imply: differentiate these in time until a control appears.
+        """Add to the control limits the equations from state equalities differentiated in time until controls appear.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then
@@ -313,7 +313,7 @@ class Linearisation:
 
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, int, Sampler]]:
-    """Group path constraints by their order, the number of time derivatives until a control appears.
+    """Group path constraints by their order, which is the number of time derivatives until a control appears.
 
     Returns:
         For each order the indices of its rows, a sampler of the derivatives of these with respect to the controls, and

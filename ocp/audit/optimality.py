@@ -135,7 +135,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add to a quadratic program, and return, the multipliers of limits that the mask ``chosen`` (M, m) selects.
+        """Add the multipliers of limits that the mask ``chosen`` (M, m) selects to a quadratic program; return them.
 
         ``slopes`` (M, m, n) are the derivatives of the limits with respect to variables of the given ``size`` (n,).
         A multiplier per unit of the horizon fraction s costs its gap times the ``share`` (M,) of its point.
@@ -159,7 +159,7 @@ class _Multipliers:
 
 
 class _Dual:
-    """Linear or quadratic program whose solution gives the multipliers of a plan, in units of cost."""
+    """Linear or quadratic program whose solution is the multipliers of a plan, in units of the cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -197,7 +197,7 @@ class _Dual:
         self._ends()
 
     def _costate_equation(self) -> None:
-        """Add the costate equation, lambda' = -dH/dx, of every interval, integrated backwards between mesh nodes."""
+        """Add the costate equation of every mesh interval, integrated backwards, to the quadratic program."""
         along, program, node = self.along, self.program, self.node
         controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
@@ -219,7 +219,7 @@ class _Dual:
             program.add(rows_of_point[states.point], states.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """Add the stationarity condition of the Hamiltonian, dH/du = 0, with a penalised residual.
+        """Add the stationarity condition of the Hamiltonian, with a penalised residual, to the quadratic program.
 
         The penalty is quadratic where H is curved in the controls, else linear. Its step is the size of the control
         along the plan or, if the control has limits, the range between them.
@@ -241,7 +241,10 @@ class _Dual:
             self.residual.append(part)
 
     def _ends(self) -> None:
-        """Add the transversality conditions, with residuals penalised by how far the controls could move the states."""
+        """Add the transversality conditions, with penalised residuals, to the quadratic program.
+
+        The price of a residual is how far the controls could move the states.
+        """
         along, program, nx, share = self.along, self.program, self.along.form.nx, self.along.share
         ends, horizon = end_limits(along), along.solution.horizon
         self.ends, free = ends, ends.free
@@ -267,7 +270,7 @@ class _Dual:
             program.add(rows[free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Return the multipliers that fit the plan best, and its excess cost, from the solution of the program."""
+        """Return the best-fitting multipliers of the plan, and its excess cost, from the solution of the program."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:
@@ -399,12 +402,12 @@ def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.nda
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return a plan's excess cost over the optimum for given multipliers, except that due to a free initial state."""
+    """Return a plan's estimated excess cost: that of all intervals, plus end multipliers times distances to limits."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the error of multipliers, in units of cost: the excess cost they imply plus errors of their equations."""
+    """Return the excess cost implied by multipliers, plus residuals of costate equation and transversality as costs."""
     assert curved is not None
     loss = _total_loss(_loss_by_interval(along, multipliers, curved), multipliers)
     return loss + multipliers.total + multipliers.ends.transversality
@@ -430,7 +433,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
 
 
 def undefined_result(along: Linearisation) -> Optimality:
-    """Return the result for a plan along which the problem has values that are not finite; all its checks fail."""
+    """Return the result, in which all checks fail, for a plan along which values of the problem are not finite."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
     rows = np.zeros(len(form.end)), np.zeros(len(form.start))

@@ -26,7 +26,7 @@ NEEDLES = 17
 
 @dataclass(frozen=True)
 class Hamiltonian:
-    """The Hamiltonian along a plan.
+    """Values of the Hamiltonian along a plan, and the scale by which they are judged.
 
     Attributes:
         values: L + costate . f at the reported times of the plan, in cost per second. Shape (M,).
@@ -151,7 +151,7 @@ def clebsch(along: Linearisation, costate: np.ndarray, control: int) -> np.ndarr
 
 
 def describe_singular_arcs(along: Linearisation, costate: np.ndarray, linear: np.ndarray, moved: np.ndarray) -> str:
-    """Return clauses on the generalised Legendre-Clebsch condition along singular arcs, "" if there are none.
+    """Return text about the generalised Legendre-Clebsch condition along singular arcs; "" if there are none.
 
     Args:
         linear: Which controls enter linearly. Shape (nu,). moved: In which intervals they switch. Shape (N, nu).
@@ -175,7 +175,7 @@ def describe_singular_arcs(along: Linearisation, costate: np.ndarray, linear: np
 def find_control_multipliers(
     along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the control limits that best fit given costates at the Gauss points.
+    """Return the multipliers of control limits at the Gauss points that best fit given costates.
 
     They minimise the gradient of T H in the controls, in units of their sizes. A limit that a plan reaches only at
     single points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that
@@ -256,7 +256,7 @@ def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
 def balance(
     gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, inverse: np.ndarray
 ) -> np.ndarray:
-    """Return multipliers of admissible sign that best balance a gradient at each point, by least squares.
+    """Return multipliers of admissible sign that best balance a gradient, by least squares, at each point of a plan.
 
     Shape (M, m). They minimise |gradient + directions' multipliers|, and are at least zero for ``upper`` limits (M, m),
     at most zero for ``lower`` limits and free for both. ``inverse`` (M, n, m) is the pseudo-inverse of the directions
@@ -273,7 +273,7 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the largest relative residual of dH/du = 0 over all controls at each point. Shape (M,)."""
+    """Return the largest relative residual of the stationarity of the Hamiltonian at each point. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))

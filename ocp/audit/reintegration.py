@@ -31,7 +31,7 @@ from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 @dataclass(frozen=True)
 class Reintegration:
-    """States that the controls of a plan produce, re-integrated on the fine grid of the plan.
+    """States that integration of the dynamics under the controls of a plan yields, on the fine grid of the plan.
 
     Attributes:
         grid: The plan on its fine grid, with M samples.
@@ -57,7 +57,7 @@ class Reintegration:
     breakdown_time: float | None
 
     def is_unstable(self, limit: float) -> bool:
-        """Return whether unstable dynamics explain why ``states`` differ from the plan by more than ``limit``.
+        """Return whether unstable dynamics explain why the re-integrated states leave the plan by more than ``limit``.
 
         This holds if the plan satisfies the dynamics within each interval: the defects, summed without growth, stay
         below a tenth of the limit up to the time at which the difference exceeds it.
@@ -92,7 +92,7 @@ def reintegrate(along: Linearisation) -> Reintegration:
 
 
 def integrated_motion(along: Linearisation) -> IntegratedMotion:
-    """Return the motion that the controls of a plan produce, integrated step by step with error control."""
+    """Return the motion under the controls of a plan, integrated step by step with error control."""
     n, cells, flow = along.shape[0], along.grid.samples - 1, Flow(along)
     plan = along.grid.states.reshape(n, cells + 1, -1)
     starts = plan[:, 0]
@@ -111,7 +111,7 @@ def integrated_motion(along: Linearisation) -> IntegratedMotion:
 
 
 def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> IntegratedMotion | None:
-    """Return the motion that the controls of a plan produce, by implicit integration, as stiff dynamics require.
+    """Return the motion under the controls of a plan, by implicit integration, which stiff dynamics require.
 
     The method is the backward differentiation formulas of CVODES. Returns None if it breaks down too.
 
@@ -152,7 +152,7 @@ def _worst(values: np.ndarray) -> np.ndarray:
 
 
 class Steps(NamedTuple):
-    """Integration steps in increasing order of time.
+    """Steps of a numerical integration, in increasing order of time.
 
     Attributes:
         cell: Grid cell (interval of the fine grid) of each step. Shape (S,).
@@ -190,7 +190,7 @@ class Flow:
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
-        """Return the integrated states and cost at the ends of all grid cells; nan after the integration breaks down.
+        """Return the integrated states and cost at the ends of all grid cells; nan after the integration fails.
 
         Args:
             chain: Number of the chain of successive cells that each cell belongs to, increasing; the cells divide the
@@ -236,7 +236,7 @@ class Flow:
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and cost after each of several integration steps, and their error estimates.
+        """Return states and cost after each of several integration steps, with error estimates.
 
         A step starts where the previous one ends or, where ``first`` is set, at its own start.
         """
@@ -279,7 +279,7 @@ def step_function(form: Formulation, nodes: np.ndarray) -> Any:
 
 
 def _control_columns(solution: Solution) -> np.ndarray:
-    """Return each interval's divided differences of the controls, its start and its width. Shape (N, nw + 2)."""
+    """Return the divided differences of the controls in each interval, its start and its width. Shape (N, nw + 2)."""
     curve = solution.control_interpolant
     differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
     return np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])
@@ -384,7 +384,7 @@ def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the `Violation` of a vector constraint.
+    """Return the `Violation` of a vector constraint, from how far each entry is beyond its bounds.
 
     For each entry, `excess` is how far it is beyond its bounds, and `sizes` the magnitude that this is compared with.
     """

@@ -46,7 +46,7 @@ class FineGrid:
     p: np.ndarray
 
     def point(self, form: Formulation, at: slice = slice(None)) -> tuple[Any, ...]:
-        """Return data at the samples `at`, and states and controls at the start, for :meth:`Formulation.sampled`."""
+        """Return states, controls, times and further data at samples `at`, the arguments of `Formulation.sampled`."""
         starts = (form.x0, self.states[0]), (form.u0, self.controls[0])
         return self.states[at], self.controls[at], self.t[at], self.horizon, self.p, *starts
 
@@ -171,7 +171,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) sizes of sampled states or controls, and a mask of those that vary or have a nonzero fixed end.
+    """Return the sizes of sampled states or controls, and a mask of those that vary or have a nonzero fixed end.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -194,7 +194,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes, raised to a minimum for quantities that stay at zero, and a mask of all other quantities."""
+    """Return sizes, raised to a minimum for quantities that remain at zero, and a mask of all other quantities."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -300,7 +300,7 @@ def _change_by_variables(
 def row_changes(
     form: Formulation, kind: str, grid: FineGrid, samples: np.ndarray, *, moves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the constraints of one kind at K samples, and their changes with each state or control.
+    """Return the values of one kind of constraint at K samples, and their changes if each state or control changes.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -38,7 +38,7 @@ multiplier."""
 
 @dataclass(frozen=True)
 class Conditions:
-    """Scaled terms of the first-order conditions at a solution: derivatives, multipliers and active constraints.
+    """Scaled terms of the first-order optimality conditions at a solution: derivatives, multipliers and active limits.
 
     Attributes:
         hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).
@@ -56,7 +56,7 @@ class Conditions:
 
 
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
-    """Return the terms of the first-order conditions at a solver's result, for the given parameters and bounds."""
+    """Return the terms of the first-order optimality conditions at a solver's result, for given data and bounds."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a = scales.variables
     jacobian = scipy.sparse.csr_array(scale_matrix(program.numbers.first(v, p)[1], 1 / scales.rows, a))
@@ -70,7 +70,7 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
 def scaled_values(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
 ) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return values, limits and multipliers of variables (x) and constraints (g) in the solver's scaled units."""
+    """Return values, limits and multipliers of all variables (x) and constraints (g) in the solver's scaled units."""
     v, lam = outcome.variables, outcome.multipliers
     slope, jacobian = program.numbers.first(v, arguments["p"])
     parts = {"x": (v, scales.variables, -(slope + jacobian.T @ lam)), "g": (outcome.rows, scales.rows, lam)}
@@ -98,7 +98,7 @@ def next_active_set(
     sides: Sides,
     tolerance: float,
 ) -> Sides | None:
-    """Return the limits of the next active set: violated limits, and active limits with multipliers of the right sign.
+    """Return the next active set: violated limits, and active limits whose multipliers have the right sign.
 
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
@@ -118,7 +118,7 @@ def next_active_set(
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return which values have equal limits, or a limit whose multiplier exceeds the distance from value to limit."""
+    """Return which values have equal limits, or a limit whose multiplier is larger than the distance to the limit."""
     with np.errstate(invalid="ignore"):
         below = (multipliers < -SOLVER_RESIDUAL) & (value - lower < -multipliers)
         above = (multipliers > SOLVER_RESIDUAL) & (upper - value < multipliers)
@@ -159,7 +159,7 @@ SETTINGS = NewtonSettings()
 
 
 class Newton:
-    """Newton's method for a nonlinear program, whose variables are ordered so that the Newton matrix is banded.
+    """Newton's method for a nonlinear program, with the variables in an order that makes the Newton matrix banded.
 
     Args:
         program, transcription: The nonlinear program, and the transcription from which it is assembled.
@@ -187,7 +187,7 @@ class Newton:
     def solve_near(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales
     ) -> Outcome | None:
-        """Return the optimum for changed parameters or bounds, found from a nearby plan; None without convergence.
+        """Return the optimum for changed parameters or bounds, computed from a nearby plan; None without convergence.
 
         The active limits of the plan are equalities at first. The result determines the next active set (Hintermueller,
         Ito, Kunisch 2002).
@@ -265,7 +265,7 @@ class Newton:
         scales: Scales,
         local: bool = False,
     ) -> _Matrix | None:
-        """Return the factorised Newton matrix for scaled variables and constraints; None unless positive definite.
+        """Return the factorised Newton matrix of scaled variables and constraints; None if it is not positive definite.
 
         ``which`` variables are fixed and which rows held. With ``local`` the penalty of a row is relative to the
         curvature of its own variables, so that rounding does not hide small variables. For a sufficient penalty the
@@ -307,7 +307,7 @@ class Newton:
 
 @dataclass(frozen=True)
 class _Matrix:
-    """Factorised Newton matrix at a point, with a penalty on the active constraints.
+    """Factorised Newton matrix at one point of a nonlinear program, with a penalty on the active constraints.
 
     Attributes:
         factors: Factors of the Hessian plus penalty.
@@ -323,7 +323,7 @@ class _Matrix:
     price: float
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the Newton step of scaled variables and multipliers by the method of multipliers."""
+        """Compute the Newton step of the scaled variables and of the multipliers by the method of multipliers."""
         place, residual = self.factors.place, self.weight * residual
         side = np.empty_like(gradient)
         side[place] = gradient
@@ -352,7 +352,7 @@ def _is_same_set(sides: Sides, other_sides: Sides) -> bool:
 
 
 class Bordered:
-    """An order of variables that makes a symmetric matrix banded, except for the border: a few variables at the end.
+    """An order of variables in which a symmetric matrix is banded, except for a border of a few variables at the end.
 
     Attributes:
         place: Position of each variable. Shape (n,).
@@ -375,14 +375,14 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the index of matrix entries (row ``first``, column ``second``) in the input of :meth:`cholesky`."""
+        """Return the indices of matrix entries (row ``first``, column ``second``) in the input of :meth:`cholesky`."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
 
     @property
     def length(self) -> int:
-        """Length of the vector of matrix entries for :meth:`cholesky`."""
+        """Length of the input vector of :meth:`cholesky`, which contains the matrix entries."""
         return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
 
     def cholesky(self, values: np.ndarray) -> Cholesky | None:
@@ -432,7 +432,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve the linear system for a right-hand side in the order of variables of :class:`Bordered`. Shape (n,)."""
+        """Solve the linear system for a right-hand side whose order of variables is that of `Bordered`. Shape (n,)."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):
@@ -445,7 +445,7 @@ class Cholesky:
 
 
 def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
-    """Choose the variables for the border of a banded matrix, so that the matrix is factorised with little work."""
+    """Choose the variables that form the border of a banded matrix, so that its factorisation takes little work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
     is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
     for k in np.argsort(-distance, kind="stable"):

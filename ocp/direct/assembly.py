@@ -24,7 +24,7 @@ from ocp.problem.values import symbols_of
 
 @dataclass(frozen=True)
 class Block:
-    """Block of a nonlinear program: a small function that is applied to several sets of the program's variables.
+    """Block of a nonlinear program: a small function that is evaluated at several sets of the program's variables.
 
     Attributes:
         function: casadi Function (v (n), d (nd), p) -> (cost, g (m)).
@@ -43,7 +43,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Stages:
-    """Numbers of states, controls and constraints of each stage of a nonlinear program, for special solvers."""
+    """Numbers of states, controls and constraints in each stage of a program, for structure-exploiting solvers."""
 
     states: tuple[int, ...]
     controls: tuple[int, ...]
@@ -52,7 +52,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class Interpolants:
-    """Rule by which interpolants of states and controls are built from the variables of a nonlinear program.
+    """Rule that builds the interpolants of states and controls from the variables of a nonlinear program.
 
     Attributes:
         breaks: Ends of the segments of the states, as fractions of the horizon; every interval has the same number of
@@ -90,7 +90,7 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """The casadi Function that computes the state values in all mesh intervals by one call."""
+        """The casadi Function that computes the state values of all mesh intervals by one call."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 
@@ -160,7 +160,7 @@ class Transcription:
         return float(form.horizon_at(p) if self.horizon is None else variables[self.horizon])
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments p, lbx, ubx, lbg and ubg for given parameters and values of the bound table."""
+        """Return the solver arguments p, lbx, ubx, lbg, ubg from the parameters and the problem's numeric bounds."""
         lower, upper = bounds
         return {
             "p": p,
@@ -173,7 +173,7 @@ class Transcription:
 
 @dataclass(frozen=True)
 class FunctionSizes:
-    """Thresholds of the number of instructions of a function, which decide how the function is built.
+    """Thresholds for the number of instructions of a function, which decide how the function is built.
 
     Attributes:
         compared: Above this number, the search for common subexpressions takes longer than a solve without it.
@@ -257,7 +257,7 @@ class NumericDerivatives:
         return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
-        """Return the upper Hessian triangle of ``sigma`` times cost plus ``lam`` times constraints. Shape (n, n)."""
+        """Return the upper Hessian triangle (n, n) of ``sigma`` times the cost plus ``lam`` times the constraints."""
         upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
@@ -271,7 +271,7 @@ class NumericDerivatives:
 
 
 class ArrayFunction:
-    """A casadi Function of dense vectors with NumPy arrays as outputs; for one thread if its work space is `kept`."""
+    """Evaluator of a casadi Function with NumPy arrays. With `kept` buffers only one thread may call it at a time."""
 
     def __init__(self, function: Any, *, kept: bool = False) -> None:
         self._function = function
@@ -283,7 +283,7 @@ class ArrayFunction:
         self._kept = self._allocate() if kept else None
 
     def _allocate(self) -> tuple[Any, Any, list[np.ndarray], list[np.ndarray]]:
-        """Return a buffer with its work space, the call that evaluates it, and the arrays of inputs and outputs."""
+        """Return casadi's buffer for an evaluation, the call that evaluates, and the arrays of inputs and outputs."""
         buffer, run = self._function.buffer()
         inputs = [np.zeros(self._function.nnz_in(i)) for i in range(self._function.n_in())]
         outputs = [np.zeros(size) for size in self._sizes]
@@ -293,7 +293,7 @@ class ArrayFunction:
         return buffer, run, inputs, outputs
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Return columns as arrays, other outputs as sparse matrices; raise RuntimeError if the evaluation fails."""
+        """Evaluate the function; return columns as arrays, others as sparse matrices; raise RuntimeError on failure."""
         buffer, run, inputs, outputs = self._kept or self._allocate()
         for own, each in zip(inputs, arguments, strict=True):
             own[:] = each.ravel()
@@ -338,7 +338,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the nonlinear program of a transcription from the derivatives of its blocks of cost and constraints.
+    """Assemble a nonlinear program from its transcription and the derivatives of its blocks of cost and constraints.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -418,7 +418,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return (row, column) in the program's Hessian, and factor, for each nonzero of a block's upper Hessian."""
+    """Return row and column in the program's Hessian, and a factor, for each nonzero of a block's Hessian triangle."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -441,14 +441,14 @@ def build_function(name: str, arguments: list[Any], outputs: list[Any]) -> Any:
 
 
 def gather(vector: Any, index: np.ndarray) -> Any:
-    """Return the entries of a vector at a matrix of indices, as a matrix of the same shape (n, K)."""
+    """Return the entries of a vector at an array of indices (n, K), as a matrix of the same shape."""
     if index.size == 0:
         return ca.MX(*index.shape)
     return ca.reshape(vector[index.ravel(order="F").tolist()], *index.shape)
 
 
 def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate the function of a block for every column of its arguments; the parameters are common to all."""
+    """Evaluate the function of a block for each column of the arguments; all columns share the parameters."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:
@@ -478,7 +478,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix: the sum of constant entries and weighted nonzeros of ``matrices``, at given positions."""
+    """Return a sparse matrix to which constants and weighted nonzeros of ``matrices`` are added at given positions."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

@@ -65,12 +65,12 @@ kills the command and removes the working folder."""
 
 
 class CompilerError(RuntimeError):
-    """Error with the reason why C code cannot be generated, compiled or loaded."""
+    """Error raised when C code cannot be generated, compiled or loaded; its message states the reason."""
 
 
 @dataclass(frozen=True)
 class CodeSizes:
-    """Largest lengths, in characters, of generated C code that is optimised and of C code that is compiled.
+    """Largest lengths, in characters, at which generated C code is optimised, and at which it is compiled at all.
 
     Attributes:
         optimized: Largest code that is optimised, which takes minutes for more and saves a third of the running time.
@@ -85,7 +85,7 @@ CODE_SIZES = CodeSizes()
 
 
 def generate_c(functions: Sequence[Any], name: str, *, header: bool = True) -> list[str]:
-    """Return C code and header (NAME.c and NAME.h) of casadi Functions as texts.
+    """Return the C code and the C header (NAME.c and NAME.h) of casadi Functions as texts.
 
     Raises:
         CompilerError: One of them has no C code.
@@ -107,7 +107,7 @@ def generate_c(functions: Sequence[Any], name: str, *, header: bool = True) -> l
 
 
 def build_library(contents: Sequence[str], text: Callable[[], str]) -> Path:
-    """Return the path of a shared library compiled from C code, from the cache if possible.
+    """Return the path of a shared library compiled from C code, which is taken from the cache if possible.
 
     Ctrl-C and time limits end the compiler.
 
@@ -137,7 +137,7 @@ def build_library(contents: Sequence[str], text: Callable[[], str]) -> Path:
 
 
 def library_key(contents: Sequence[str]) -> str:
-    """Return the name of a library in the cache; raise CompilerError if there is no compiler."""
+    """Return the name in the cache of a library with given contents; raise CompilerError if there is no compiler."""
     machine = (platform.machine(), sys.platform, ca.__version__, str(CODE_SIZES.optimized))
     return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *contents)
 
@@ -176,7 +176,7 @@ def _version(command: str, path: str) -> str:
 
 
 def _compile(text: str) -> bytes:
-    """Compile C code and return the contents of the shared library; raise the errors of :func:`build_library`."""
+    """Compile C code and return the contents of the shared library; raise the same errors as `build_library`."""
     if len(text) > CODE_SIZES.accepted:
         raise CompilerError(f"{len(text)} characters of C are more than {CODE_SIZES.accepted}")
     speed = "-O1" if len(text) <= CODE_SIZES.optimized else "-O0"
@@ -222,7 +222,7 @@ def _exit_status(process: subprocess.Popen[bytes]) -> int:
 
 
 def function_key(function: Any) -> str:
-    """Return a text that identifies a casadi Function: its serialised form, or else its id in this process."""
+    """Return a text that identifies a casadi Function: its serialised form or, failing that, its id in this process."""
     try:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
@@ -231,7 +231,7 @@ def function_key(function: Any) -> str:
 
 @lru_cache
 def warn_interpreted(reason: str) -> None:
-    """Log once the reason why functions are interpreted instead of compiled."""
+    """Log once the reason why casadi Functions are interpreted instead of compiled."""
     LOG.warning("functions are interpreted, which is slower: %s", reason)
 
 
@@ -271,13 +271,13 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 
 
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write the C files of a problem for a controller to a folder; return the folder and raise as :func:`write_c`."""
+    """Write the C files of a problem for a controller to a folder, return the folder and raise as `write_c` does."""
     texts = {"curves.h": CURVES, "problem.h": problem_header(form, transcription), "main.c": MAIN, "Makefile": MAKEFILE}
     return write_c(form, controller_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
 
 
 def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path, texts: dict[str, str]) -> Path:
-    """Write functions of a problem as NAME.c and NAME.h, and further files, to a folder that is created and returned.
+    """Write functions of a problem to a folder as NAME.c and NAME.h, with further files, and return the folder.
 
     Each file is written completely or not at all; files of the same names are replaced.
 
@@ -299,7 +299,7 @@ def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path,
 
 
 def problem_header(form: Formulation, transcription: Transcription) -> str:
-    """Return the text of the C header problem.h: sizes, names, and breaks and nodes of the interpolants."""
+    """Return the text of the C header problem.h: sizes, names, and the breaks and nodes of the interpolants."""
     curves = transcription.interpolants
     sizes = {
         "VARIABLES": transcription.size,
@@ -323,7 +323,7 @@ def problem_header(form: Formulation, transcription: Transcription) -> str:
 
 
 def c_strings(name: str, texts: Sequence[str]) -> str:
-    """Return the C definition of an array of texts, which a null pointer ends."""
+    """Return the C definition of a null-terminated array of strings."""
     return f"static const char *const {name}[] = {{{', '.join([*map(c_string, texts), '0'])}}};"
 
 
@@ -486,7 +486,7 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
 
 
 def compile_functions(contents: Sequence[str], names: Sequence[str], build: Callable[[], Sequence[Any]]) -> list[Any]:
-    """Return casadi Functions from a compiled library or, with one warning, interpreted if they cannot be compiled.
+    """Return compiled casadi Functions or, with a warning, interpreted Functions if they cannot be compiled.
 
     Args:
         contents: As of :func:`build_library`.

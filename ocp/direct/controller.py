@@ -45,7 +45,7 @@ OUTPUTS = ("control", "x", "lam_x", "lam_g", "cost", "rows", *MEASURES)
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """Settings of a controller; see :meth:`ocp.direct.prepared.Prepared.controller`."""
+    """Settings of a model predictive controller, as :meth:`ocp.direct.prepared.Prepared.controller` documents them."""
 
     iterations: int = 5
     qp_iterations: int = 100
@@ -62,7 +62,7 @@ class ControllerSettings:
 
 @dataclass(frozen=True)
 class ControlStep:
-    """Result of one step of a :class:`Controller`.
+    """Result of one step of a :class:`Controller`: the control to apply, with its cost and its violations.
 
     Attributes:
         control: Controls at the begin of the horizon, by name; they keep the bounds of the controls. Shape (n,) each.
@@ -103,7 +103,7 @@ class ControlStep:
 
 
 class Controller:
-    """A controller with a receding horizon; see :meth:`ocp.direct.prepared.Prepared.controller`.
+    """Model predictive controller: each step solves the problem over a horizon that recedes with time.
 
     A step depends only on its arguments and on the steps before. Only one thread may use a controller.
 
@@ -128,7 +128,7 @@ class Controller:
         self.reset(plan)
 
     def reset(self, plan: Solution) -> None:
-        """Restart the controller from a plan, which the next step does not shift in time.
+        """Restart the controller from a plan, which the next step uses without a shift in time.
 
         Raises:
             ProblemError: The plan is not a solution of the prepared problem.
@@ -152,7 +152,7 @@ class Controller:
         self._is_first, self._last = True, dict[str, np.ndarray]()
 
     def step(self, parameters: ByName = None) -> ControlStep:
-        """Solve the problem for new parameters, such as the measured state, from the previous step's shifted result.
+        """Solve the problem for new parameters, such as the measured state, starting from the shifted last result.
 
         Raises:
             ProblemError: A parameter is missing, unknown, of a wrong size or not finite, or a bound is not a number or
@@ -280,7 +280,7 @@ class Controller:
         return solver, ca.Function("controller_step", [p, x, lam_x, lam_g, is_shifted], final, names, list(OUTPUTS))
 
     def _attempt(self, solver: Any, functions: ProgramFunctions) -> Any:
-        """Return a casadi Function that solves once from the last result and returns control, result and violations."""
+        """Return a casadi Function that solves the program once from the last result and measures the violations."""
         transcription, form = self._prepared.transcription, self._prepared.formulation
         x, p, is_shifted = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np), ca.MX.sym("shift")
         lam_x, lam_g = ca.MX.sym("lam_x", transcription.size), ca.MX.sym("lam_g", transcription.n_rows)
@@ -325,7 +325,7 @@ class Controller:
 
 
 class ProgramFunctions(NamedTuple):
-    """Functions of the nonlinear program of a controller, as casadi Functions with the names that sqpmethod uses.
+    """The casadi Functions of the nonlinear program of a controller, named as casadi's solver sqpmethod requires.
 
     Attributes:
         values: (x, p) -> cost, rows.
@@ -358,7 +358,7 @@ def program_functions(prepared: Any, hessian: str) -> ProgramFunctions:
 
 
 def gauss_newton_hessian(function: Any) -> Any:
-    """Return the Gauss-Newton Hessian of a block's cost: (v, d, p, sigma, lam) -> upper triangle (n, n).
+    """Return a casadi Function that evaluates the Gauss-Newton Hessian (upper triangle) of the cost of a block.
 
     ``function`` is that of a :class:`ocp.direct.assembly.Block`. If its cost is w r^2 + ... + c, the Hessian is
     2 w r' r'^T + ... plus the exact Hessian of c, the part without squares. Functions that cannot be expanded to
@@ -378,7 +378,7 @@ def gauss_newton_hessian(function: Any) -> Any:
 
 
 def split_squares(cost: Any, variables: Any) -> tuple[list[Any], list[Any], Any]:
-    """Return residuals r, weights w and a remainder c with ``cost = sum w r^2 + c + constant`` for SX expressions.
+    """Split an SX cost into ``sum w r^2 + c``, up to a constant, with residuals r, weights w and a remainder c.
 
     Only the weights do not depend on the variables. A square that is multiplied by an expression of the variables
     belongs to the remainder.

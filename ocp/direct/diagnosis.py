@@ -52,7 +52,7 @@ SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
-    """Protocol of a prepared problem with the attributes that its diagnosis uses."""
+    """Interface of a prepared problem with the attributes that its diagnosis uses."""
 
     problem: Problem
     formulation: Formulation
@@ -75,7 +75,7 @@ def diagnosis(
     attempts: Sequence[str],
     badly_scaled: str,
 ) -> SolveError:
-    """Return an error that reports conflicting constraints and the largest residuals by constraint, state and time.
+    """Return a SolveError that reports conflicting constraints and the largest residuals of a failed solve.
 
     Args:
         outcome, arguments, solution: Of the first attempt, or of the one in which the time ran out.
@@ -130,7 +130,7 @@ def diagnosis(
 
 
 def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]) -> list[str]:
-    """Return labels, with times, of constraints with linearly dependent gradients, in decreasing order of weight.
+    """Return labels and times of constraints with linearly dependent gradients, in decreasing order of weight.
 
     They are the constraints with large entries in a vector y with J^T y = 0, found by inverse iteration with J J^T; J
     is the Jacobian of the equations, with rows of length 1, in the variables that are not fixed.
@@ -162,7 +162,7 @@ def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.nda
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Return lines that tell which states and controls are at their bounds, when, and for what share of the plan."""
+    """Return text lines that state which states and controls are at bounds, when, and for what share of the plan."""
     form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
@@ -186,7 +186,7 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
 def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Return labels, horizon fractions, values and violations of all constraints, then of all variables."""
+    """Return labels, horizon fractions, values and violations of all constraints, followed by all variables."""
     form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
@@ -200,7 +200,7 @@ def residuals(
 
 
 def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper bounds of the constraints and, after them, of the variables."""
+    """Return the lower and the upper bounds of the constraints, followed by those of the variables."""
     low, high = (np.concatenate([arguments[f"{side}g"], arguments[f"{side}x"]]) for side in ("lb", "ub"))
     return low, high
 
@@ -253,14 +253,14 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Elastic:
-    """The plan of least constraint violation: values of all variables, and violated constraints, the worst first."""
+    """The plan of least constraint violation: values of all variables, and the violated constraints, worst first."""
 
     plan: np.ndarray
     conflicts: tuple[Conflict, ...]
 
 
 def elastic_plan(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Elastic | None:
-    """Return the plan that satisfies the dynamics and fixed ends, and violates the other constraints least.
+    """Return the plan that meets dynamics and fixed ends, and violates the other constraints as little as possible.
 
     None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
     failure, and if no plan is found in the remaining time.
@@ -337,7 +337,7 @@ def elastic_plan(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray
 
 
 class _Soft:
-    """Limits that an elastic plan may violate: all but dynamics, fixed ends and the lower bound of the horizon.
+    """Limits that the plan of least violation may violate: all but dynamics, fixed ends and the least horizon.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -369,9 +369,9 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return the matrices R and C that form the constraints R g(v) + C (v, slack) of the elastic program.
+        """Return the matrices that combine constraints, variables and slacks to the constraints of the elastic program.
 
-        The n variables are v, the m constraints of the problem are g(v), and the k slacks measure violations.
+        The constraints are R g(v) + C (v, slack), with n variables v, m constraints g of the problem, and k slacks.
         """
         chosen = np.concatenate([self.hard, self.lower, self.upper])
         number = np.arange(len(chosen))
@@ -391,7 +391,7 @@ class _Soft:
         return lower, np.concatenate([high[self.hard], free[: len(self.lower)], high[self.upper]])
 
     def conflicts(self, values: np.ndarray, horizon: float, units: np.ndarray) -> list[Conflict]:
-        """Return the violated constraints with violations in the constraints' units, in decreasing order."""
+        """Return the violated constraints as a list of conflicts, sorted by decreasing relative violation."""
         low, high = self.bounds
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

@@ -272,7 +272,7 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
 
 
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
-    """Return the casadi Function of one integration step, and whether to inline the function as an SX function.
+    """Return the casadi Function of one integration step, and whether the step is to be inlined as an SX function.
 
     It maps (x, w, d, step number, T, p) to the next state and the running cost of the step. Its arguments are state,
     control variables, start and width of the interval as fractions of the horizon, step number, horizon and parameters.
@@ -318,7 +318,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the casadi Function that samples the states inside a mesh interval by cubic Hermite interpolation.
+    """Return the casadi Function that computes states inside a mesh interval by cubic Hermite interpolation.
 
     It maps ([x; w], d, T, p), as in :func:`step_function`, to the states at the `THIRDS` of each integration step.
     """

@@ -25,7 +25,7 @@ Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,)
 
 
 def initial_point(form: Formulation, transcription: Transcription, guess: Guess, bounds: Bounds) -> np.ndarray:
-    """Return the initial point of the solver, a value for every variable of the program, from a guess. Shape (size,).
+    """Return the initial point of the solver, a value for each variable of the program, from a guess. Shape (size,).
 
     ``guess`` takes precedence over the guess declared with a variable. Without either the values follow a straight line
     between the fixed ends, or the middle of the bounds. A solution on another grid or by another method is read over
@@ -84,7 +84,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
 
 
 def guessed_names(form: Formulation, guess: Guess) -> set[str]:
-    """Return the names of the states, controls and ``horizon`` for which the guess or the problem states a value."""
+    """Return the names of states and controls, and ``horizon``, for which the guess or the problem states a value."""
     names = {name for name, value in form.guesses.items() if value is not None}
     if form.horizon_guess is not None:
         names.add("horizon")
@@ -94,7 +94,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each variable's and each constraint's counterpart ``intervals`` mesh intervals later.
+    """Return, for each variable and constraint, the index of its counterpart ``intervals`` mesh intervals later.
 
     Where the horizon ends earlier, it is the index of the variable or row itself.
     """
@@ -137,7 +137,7 @@ def _trajectory(name: str, value: Any, size: int, horizon: float, times: Any) ->
 
 
 def evaluate_guess(name: str, function: Callable[[float], Any], time: float, size: int) -> np.ndarray:
-    """Evaluate a guess function of ``size`` entries at a time, s; raise ProblemError if the function fails."""
+    """Evaluate a user's guess function of ``size`` entries at a time, s; raise ProblemError if the function fails."""
     try:
         value = function(time)
     except Exception as error:  # any error of the user's function
@@ -148,7 +148,7 @@ def evaluate_guess(name: str, function: Callable[[float], Any], time: float, siz
 
 @dataclass(frozen=True)
 class Samples:
-    """A guess sampled over time, callable at one time or at many.
+    """A guess given by samples over time, which can be evaluated at one time or at many times.
 
     Attributes:
         t: Times, s, increasing. Shape (M,).
@@ -159,7 +159,7 @@ class Samples:
     values: np.ndarray
 
     def over(self, times: np.ndarray) -> np.ndarray:
-        """Return the guess at K times, interpolated linearly between the samples and constant outside. Shape (K, n)."""
+        """Return the guess at K times by linear interpolation, constant outside of the samples. Shape (K, n)."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
 
     def __call__(self, time: float) -> np.ndarray:
@@ -168,7 +168,7 @@ class Samples:
 
 
 def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
-    """Return, by name, the trajectory of every state and control that an earlier solution shares with the problem.
+    """Return, by name, the trajectories of the states and controls that an earlier solution shares with a problem.
 
     At a node, a control has the left limit: a control variable there belongs to the interval that ends there.
     """
@@ -200,7 +200,7 @@ def broadcast_guess(name: str, value: Any, size: int) -> np.ndarray:
 
 
 def default_horizon(form: Formulation, bounds: Bounds) -> float:
-    """Return the declared guess of the horizon, clipped to the bounds, or a default value inside the bounds."""
+    """Return the horizon at which a solve starts: the declared guess, clipped to the bounds, or a default value."""
     place = form.bounds.places["horizon"][0]
     low, high = bounds[0][place], bounds[1][place]
     if form.horizon_guess is not None:
@@ -209,7 +209,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """Return a default guess: a line between fixed ends, else the middle of the bounds or the value nearest zero."""
+    """Return a default guess: a line between fixed ends, else the middle of the bounds or the value nearest to zero."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -272,7 +272,7 @@ def alternative_starts(
 
 
 def displace(transcription: Transcription, point: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return a guess displaced by a seeded random share, constant in time, of the size of each state and control."""
+    """Return a guess with each state and control displaced by a constant share of its magnitude, with random sign."""
     result, random = point.copy(), np.random.default_rng(0)
     for role in ("state", "control"):
         chosen = np.flatnonzero(transcription.variable_role == role)
@@ -283,7 +283,7 @@ def displace(transcription: Transcription, point: np.ndarray, sizes: np.ndarray)
 
 
 def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the guess with states replaced by a simulation from its start under its controls. Shape (size,).
+    """Return a guess whose states are replaced by a simulation of the dynamics under its controls. Shape (size,).
 
     Classical Runge-Kutta steps between the fractions of the states. From the first state that is not finite on, the
     states are constant.

@@ -145,13 +145,13 @@ def build_solver(
 
 
 def iteration_limit(solver: str, options: dict[str, Any]) -> int:
-    """Return the iteration limit in a solver's options; 0 if the limit is not a number."""
+    """Return the iteration limit among the options of a solver; 0 if the given limit is not a number."""
     limit = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
     return int(limit) if isinstance(limit, int | float | np.number) else 0
 
 
 def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
-    """Return the derivatives of a nonlinear program with the signatures that casadi's fatrop interface uses.
+    """Return the derivatives of a nonlinear program with the signatures that casadi's fatrop interface requires.
 
     The interface raises unless the next state has factor 1 in the rows that close gaps. A zero Jacobian therefore stops
     the solver, which cannot be stopped otherwise.
@@ -177,12 +177,12 @@ def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """Return an expression with infinite entries replaced by huge numbers of the same sign, nan by a huge number."""
+    """Return an expression in which infinite entries are huge numbers of the same sign, and nan is a huge number."""
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
 def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
-    """Run a solver and return its result, which is the last iterate if Ctrl-C or a time limit stops the solver."""
+    """Run a solver and return its result: the last iterate if Ctrl-C or a time limit stops the solver."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
     progress.open(arguments["lbg"], arguments["ubg"])
@@ -255,7 +255,7 @@ def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeErr
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:
-    """Return whether ipopt stalls at a solution because rounding of large values exceeds its absolute tolerances."""
+    """Return whether ipopt stalls at a solution only because rounding errors exceed its absolute tolerances."""
     history = stats["iterations"]
     states, forces = (max(1.0, float(ca.norm_inf(result[key]))) for key in ("x", "lam_g"))
     return bool(history["inf_pr"][-1] <= SOLVER_RESIDUAL * states and history["inf_du"][-1] <= SOLVER_RESIDUAL * forces)
@@ -269,7 +269,7 @@ def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.nda
 
 
 def tighten_for_fatrop(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return solver arguments with bounds tightened as much as fatrop relaxes them, so that plans meet the bounds."""
+    """Return solver arguments whose bounds are tightened by as much as fatrop relaxes them."""
     relaxation, result = 1e-8, dict(arguments)  # fatrop's own; its casadi interface has no option for it
     for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
         lower, upper = arguments[low], arguments[high]
@@ -366,7 +366,7 @@ def report_nodes(transcription: Transcription) -> np.ndarray:
 def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the optimal cost with respect to parameters, which may also shift active bounds."""
+    """Return the derivative of the optimal cost with respect to parameters, on which bounds may also depend."""
     v, lam = outcome.variables, outcome.multipliers
     direct = program.numbers.parametric(v, p, lam)
     slope, jacobian = program.numbers.first(v, p)
@@ -379,7 +379,7 @@ def _cost_gradient(
 
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
-    """Return the piecewise polynomial through the reported costates, with both ends of each interval as nodes."""
+    """Return the piecewise polynomial through the reported costates; its nodes include both ends of each interval."""
     n, node_of = len(transcription.mesh) - 1, report_nodes(transcription)
     starts = np.searchsorted(node_of, np.arange(n))
     width = starts[1] - starts[0] if n > 1 else len(node_of) - 1

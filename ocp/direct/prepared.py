@@ -43,7 +43,7 @@ from ocp.storage import checked_path
 
 
 class DirectMethod(MeshedMethod):
-    """A direct method, for which a problem is prepared once and solved many times."""
+    """A direct method, which prepares a problem once, as a nonlinear program, for repeated solves."""
 
     @interruptible
     def prepare(
@@ -68,7 +68,7 @@ class DirectMethod(MeshedMethod):
 
 
 class Prepared:
-    """A problem prepared by a direct method for repeated solves; only one thread solves at a time.
+    """A problem prepared by a direct method for repeated solves; only one thread solves it at a time.
 
     Attributes:
         problem, method: The problem and the method.
@@ -110,7 +110,7 @@ class Prepared:
 
     @cached_property
     def scaled(self) -> Program:
-        """The scaled nonlinear program, see :func:`ocp.direct.scaling.scaled_program`."""
+        """The nonlinear program in scaled variables; see :func:`ocp.direct.scaling.scaled_program`."""
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
@@ -166,7 +166,7 @@ class Prepared:
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write C code: a plan, the functions of its problem, and an example main program that uses them.
+        """Write a plan and the functions of the problem as C code, with an example main program that uses them.
 
         Args:
             folder: Folder that is created and returned; files of the same names are replaced. Its contents are listed
@@ -198,7 +198,7 @@ class Prepared:
         tolerance: float = 1e-6,
         shift: int = 1,
     ) -> Controller:
-        """Return a controller with a receding horizon, whose steps take a bounded number of iterations.
+        """Return a model predictive controller, each step of which takes a bounded number of iterations.
 
         ``controller.step(parameters)`` solves the problem for the measured state and other parameters from the result
         of the last step, and returns the control to apply, the prediction, and what is known of its feasibility.
@@ -230,7 +230,9 @@ class Prepared:
         shift: int,
         start: str,
     ) -> Solution:
-        """Solve by Newton's method if the guess is a plan, else from the guess, other points or a relaxed problem."""
+        """Solve by Newton's method if the guess is a plan; else, or if it fails, by the solver: from the guess, from
+        alternative initial points, and last from the plan of least constraint violation.
+        """
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -294,7 +296,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Return the plan of least constraint violation after the run `first` has failed; None if there is none.
+        """Return the plan of least constraint violation after the run `first` has failed; None if none is found.
 
         On Ctrl-C, Interrupted is raised with the plan of that run.
         """
@@ -340,12 +342,12 @@ class Prepared:
 
     @cached_property
     def _newton(self) -> Newton:
-        """Newton's method for solves whose guess is a plan of this nonlinear program."""
+        """Newton's method for solves that start from a plan of this nonlinear program."""
         return Newton(self.program, self.transcription)
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver for alternative initial points, with a reduced iteration limit, and its callback."""
+        """The solver, and its callback, for alternative initial points, with a reduced iteration limit."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -382,7 +384,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales of the program for an initial point; ``names`` are the variables that the guess states."""
+        """Return the scales of the program at an initial point; ``names`` are the variables with a guess."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, self._sizes(point, names, bounds, p), point, p)
@@ -392,7 +394,7 @@ class Prepared:
         return scales
 
     def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Sizes:
-        """Return the magnitudes of the variables for an initial point; ``names`` are those that the guess states."""
+        """Return the magnitudes of the variables at an initial point; ``names`` are the variables with a guess."""
         return sizes_along(self._pattern, point, names, bounds=bounds, p=p)
 
     @property
@@ -409,7 +411,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the solver from one initial point, the start.
+    """Record of one run of the solver from one initial point, the start.
 
     Attributes:
         start: Name of the start.
@@ -435,12 +437,12 @@ class Attempt:
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start is to be tried: the solver succeeded, or the time limit is reached."""
+        """Whether no other start will be tried: the solver has succeeded, or the time limit is reached."""
         return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
     def is_broken(self) -> bool:
-        """Whether a function value was not finite, or an integrator failed."""
+        """Whether the run ended because a function value was not finite or an integrator failed."""
         return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:
@@ -448,7 +450,7 @@ class Attempt:
 
 
 def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
-    """Tighten bounds in place by given amounts, at most to the middle of lower and upper bound; equalities stay."""
+    """Tighten bounds in place by given amounts, at most to the middle of both bounds; equalities stay unchanged."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
         is_range = low < high

@@ -63,7 +63,7 @@ SCALING = ScalingSettings()
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales of a nonlinear program: divisors of its n variables, of its m constraints and of its cost."""
+    """Scales of a nonlinear program, by which its n variables, its m constraints and its cost are divided."""
 
     variables: np.ndarray
     rows: np.ndarray
@@ -105,7 +105,7 @@ class Sizes:
 
 
 class Pattern:
-    """Sparsity structure of a nonlinear program, determined once for repeated computation of its scales.
+    """Sparsity structure of a nonlinear program, determined once for repeated computation of the program's scales.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
@@ -223,7 +223,7 @@ def sizes_along(
 
 
 def _displaced(pattern: Pattern, point: np.ndarray, sizes: np.ndarray, ends: Bounds) -> np.ndarray:
-    """Return a point of the program with each state and control displaced by a share of its magnitude, range or 1.
+    """Return a point with each state and control displaced by a share of its magnitude (of its range if unknown).
 
     A derivative such as the cosine of a right angle may vanish at the guess, but does so nowhere near it.
 
@@ -259,7 +259,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Compute the scales of a nonlinear program from magnitudes of its variables and its derivatives at a point."""
+    """Compute the scales of a nonlinear program from the magnitudes of the variables and derivatives at a point."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -307,7 +307,7 @@ def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales:
 
 
 def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
-    """Replace computed scales of variables by declared magnitudes, if any, rounded to powers of two."""
+    """Replace the computed scales of variables by their declared magnitudes, if any, rounded to powers of two."""
     form = pattern.form
     declared = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
     declared[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
@@ -329,7 +329,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class PredeterminedVariables:
-    """Variables of a nonlinear program that the initial state determines whatever the controls are, and their limits.
+    """Variables of a program that the initial state determines regardless of the controls, and limits on them.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """
@@ -365,7 +365,7 @@ class PredeterminedVariables:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Return a solver's result, marked as infeasible if it violates a limit on predetermined variables.
+        """Return a solver's result, marked infeasible if variables that the initial state determines violate limits.
 
         Args:
             scales: Units in which violations are judged.

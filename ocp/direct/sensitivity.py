@@ -117,7 +117,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
 
 
 def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
-    """Return the formulation, the transcription and the nonlinear program of which a plan is an optimum.
+    """Return the formulation, the transcription and the nonlinear program of which a given plan is an optimum.
 
     Raise ProblemError for any other plan.
     """
@@ -145,7 +145,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differentiate Lagrangian gradient and constraints with respect to k parameters. Shapes (n, k) and (m, k)."""
+    """Differentiate the gradient of the Lagrangian (n, k) and the constraints (m, k) with respect to k parameters."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function
@@ -207,9 +207,9 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the controls at the reported times from those of all variables. Shape (M, nu, k).
+    """Return the derivatives of the controls with respect to k parameters, from those of all variables, at M times.
 
-    The controls are linear in the variables, so that differences are exact.
+    Shape (M, nu, k). The controls are linear in the variables, so that differences are exact.
     """
     v, columns = solution.variables, []
     for direction in dv.T:

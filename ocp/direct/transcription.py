@@ -57,7 +57,7 @@ class Layout:
 def variable_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, *, staged: bool, keep_initial: bool
 ) -> Layout:
-    """Return the layout of the variables in the order node 0, interval 0, node 1, ..., node N.
+    """Return the layout of the variables of a program, in the order node 0, interval 0, node 1, ..., node N.
 
     The plain layout ends with a free horizon. In the staged layout each node also carries the horizon and, with
     ``keep_initial``, the start, and each interval a copy of its end.
@@ -81,7 +81,7 @@ def variable_layout(
 
 @dataclass
 class TranscriptionBuilder:
-    """Builder of the nonlinear program of a problem; :meth:`finish` numbers the constraints stage by stage.
+    """Builder of the nonlinear program of a problem, to which variables and constraints are added step by step.
 
     Args:
         formulation: The problem.
@@ -163,7 +163,7 @@ class TranscriptionBuilder:
                 self.linear(ties, layout.node[:, :1], -1.0)
 
     def point(self, states: np.ndarray, controls: np.ndarray, stages: np.ndarray) -> np.ndarray:
-        """Stack the indices of the states (nx, K) and controls (nu, K) of K points, and of a free horizon."""
+        """Stack the variable indices of the states (nx, K), controls (nu, K) and free horizon of K points."""
         horizon = [] if self.layout.horizon is None else [self.layout.horizon[stages][None, :]]
         return np.vstack([states, controls, *horizon])
 
@@ -198,18 +198,18 @@ class TranscriptionBuilder:
         return first + np.arange(m * places).reshape(places, m).T
 
     def state_rows(self, kind: str, stages: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Allocate equations of a kind, such as "dynamics", of all states at each of K points; see :meth:`rows`."""
+        """Allocate equations of one kind, such as "dynamics", for all states at each of K points; see :meth:`rows`."""
         return self.rows(tuple(f"{kind} of {label}" for label in self.formulation.state_labels), None, stages, at)
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
-        """Add linear terms ``values * variable[columns]`` to constraints; the arrays are broadcast together."""
+        """Add linear terms ``values * variable[columns]`` to the constraints ``rows``; the arrays are broadcast."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
-        """Declare path constraints at K points, at which the states (nx, K) and controls (nu, K) have given indices."""
+        """Declare path constraints at K points, given the variable indices of states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -219,7 +219,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare path constraints at every mesh node; at the first, only those that fixed initial states leave open.
+        """Declare path constraints at all mesh nodes, at the first only those that initial states do not determine.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
@@ -232,7 +232,7 @@ class TranscriptionBuilder:
             self.path_rows(rows, states[:, 1:], controls[:, 1:], nodes[1:], at=self.mesh[1:])
 
     def ends(self, first: WeightedControls, last: WeightedControls) -> None:
-        """Declare start and end constraints and the terminal cost.
+        """Declare the start and end constraints and the terminal cost.
 
         Args:
             first, last: Control variables of the first and the last interval, and the weights with which they give the
@@ -251,7 +251,7 @@ class TranscriptionBuilder:
     def _end_block(
         self, rows: Rows, cost: Any, place: int, controls: WeightedControls, initial: WeightedControls
     ) -> None:
-        """Add the block with the constraints and the cost at the start (place 0) or the end (place 1) of the horizon.
+        """Add the block of the constraints and the cost at the start (place 0) or the end (place 1) of the horizon.
 
         Its variables are the state, the controls, the start state and start controls, and the horizon, as far as used.
         """
@@ -338,7 +338,7 @@ class TranscriptionBuilder:
 
 
 class MeshedMethod(ABC):
-    """A method that turns a problem into a nonlinear program on a mesh of intervals.
+    """Base class of methods that turn a problem into a nonlinear program on a mesh of intervals.
 
     Attributes:
         intervals: Number of intervals.
@@ -362,11 +362,11 @@ class MeshedMethod(ABC):
 
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
-        """Return a problem's nonlinear program, which ``staged`` orders for a structure-exploiting solver."""
+        """Return a problem's nonlinear program; if ``staged``, ordered for a structure-exploiting solver."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The method as a solution stores it: the name of its class, and its attributes that are not None."""
+        """The method as a solution stores it: the name of the class, and all attributes that are not None."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if v is not None}  # type: ignore[call-overload]
         return {"type": type(self).__name__, **values}
 
@@ -387,7 +387,7 @@ class MeshedMethod(ABC):
         return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
 
     def with_nodes_at(self, fractions: Any) -> Self:
-        """Return the method with additional nodes at fractions 0..1 of the horizon, for example at jumps of a limit.
+        """Return the method with more mesh nodes at fractions 0..1 of the horizon, for example at jumps of a limit.
 
         A given mesh keeps its nodes. Without one the intervals between the fractions are equal and no wider than
         before.

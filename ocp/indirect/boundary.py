@@ -24,7 +24,7 @@ LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nod
 
 
 class BoundaryProblem:
-    """Boundary value problem of states and costates, y = [x; lambda], in consecutive shooting segments.
+    """Boundary value problem of the states x and costates lambda, y = [x; lambda], in consecutive shooting segments.
 
     Each segment is integrated from its own y with data q = [start time, duration, horizon, p, bang values, guess].
 
@@ -45,7 +45,7 @@ class BoundaryProblem:
         self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
     def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
-        """Return the residual of the boundary value problem and its Jacobian as functions of unknowns and data.
+        """Return the CasADi Functions of the residual of the boundary value problem and of the residual's Jacobian.
 
         They depend on the numbers of segments of the arcs, by which they are cached.
         """
@@ -59,7 +59,7 @@ class BoundaryProblem:
         return self._systems[key]
 
     def _multiple_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return unknowns, data and equations of multiple shooting: continuity, switching and end conditions."""
+        """Return unknowns, data and residuals of multiple shooting: continuity, switching and end conditions."""
         form = self.form
         at, of = self.layout(arcs), self._data_layout(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
@@ -83,7 +83,7 @@ class BoundaryProblem:
         return z, data, ca.vertcat(*residuals)
 
     def _backward_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return unknowns, data and equations of backward shooting from an unknown end state to the given start."""
+        """Return unknowns, data and residuals of backward shooting from an unknown end state to the given start."""
         nx, of = self.form.nx, self._data_layout(arcs)
         z, data = ca.MX.sym("z", nx), ca.MX.sym("data", of["guess"].stop)
         return z, data, self._integrate_backwards(z, data, arcs)[-1][:nx, :] - data[of["ends"]][nx : 2 * nx]
@@ -103,7 +103,7 @@ class BoundaryProblem:
         return nodes
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the integrator's data vectors q of all shooting segments as the columns of a matrix."""
+        """Return the data that the integrator takes for all shooting segments, as the columns of a matrix."""
         of, total = self._data_layout(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -121,7 +121,7 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Split states and costates ``y`` and data ``q`` into arguments of the Hamiltonian system's functions.
+        """Split the states and costates ``y`` and data ``q`` of segments into arguments of the Hamiltonian system.
 
         ``at`` are the times, s.
         """
@@ -145,7 +145,7 @@ class BoundaryProblem:
         return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
-        """Return the CasADi Function that integrates states, costates, running cost and dH/dT over a shooting segment.
+        """Return the CasADi Function that integrates states, costates and running cost over a shooting segment.
 
         (y, q) -> (y at ``places``, integrals of L and dH/dT).
         """
@@ -164,7 +164,7 @@ class BoundaryProblem:
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and costates at points of a segment, and integrals over the segment; nan after a failure.
+        """Return states and costates at points of a segment, and integrals over the segment; nan if this fails.
 
         Shapes (2 nx, places) and (2,).
         """
@@ -172,7 +172,7 @@ class BoundaryProblem:
         return states, integrals.ravel()
 
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
-        """Return states and costates at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
+        """Return states and costates at a position 0..1 of a segment that has the start values ``y``. Shape (2 nx,)."""
         if place == 0.0:
             return y
         return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
@@ -180,7 +180,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Convert unknowns to node states and costates (2 nx, S + 1), segment data, switch times and horizon."""
+        """Convert the unknowns to states and costates at the S + 1 nodes, segment data, switch times and horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -207,13 +207,13 @@ def evaluate(function: Any, *arguments: np.ndarray, failed: float = np.nan) -> l
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Return, by name, the slices of consecutive parts of a stacked vector, from the sizes of the parts."""
+    """Return, by name, the slices of a stacked vector that consecutive parts of given sizes occupy."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 
 
 def check_backward(ham: Hamiltonian) -> None:
-    """Raise ProblemError if backward shooting does not support the problem."""
+    """Raise ProblemError, with the reasons, if backward shooting does not support the problem."""
     form = ham.form
     low, high = numeric_bounds(form)
     fixed = {end: low[form.bounds.places[end]] == high[form.bounds.places[end]] for end in ("initial", "terminal")}
@@ -291,14 +291,14 @@ class NewtonResult:
 
     @property
     def success(self) -> bool:
-        """Whether Newton's method converged, and no later check rejected its result."""
+        """Whether Newton's method converged, and no later check rejected the result."""
         return self.status.is_success
 
 
 def newton(
     system: tuple[Any, ...], start: np.ndarray, data: np.ndarray, *, scale: float, tolerance: float
 ) -> NewtonResult:
-    """Solve a sparse nonlinear system by damped Newton steps, each halved until the residual decreases."""
+    """Solve a sparse nonlinear system of equations by damped Newton steps, each halved until the residual decreases."""
     residual, jacobian = system
 
     def residual_at(z: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from ocp.tolerances import ROUNDING_SHARE
 
 @dataclass(frozen=True)
 class Hamiltonian:
-    """Hamiltonian system of an optimal control problem: the Hamiltonian H, and the controls that minimise H.
+    """Hamiltonian system of an optimal control problem: the Hamiltonian H and the controls that minimise H.
 
     Attributes:
         form: The problem.
@@ -73,7 +73,7 @@ class Hamiltonian:
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
     def flow(self) -> Any:
-        """Return the CasADi Function of state rates, costate rates, running cost and dH/dT under the optimal control.
+        """Return the CasADi Function of state rates, costate rates and running cost under the optimal control.
 
         (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT).
         """
@@ -94,7 +94,7 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return path equality multipliers that make the Hamiltonian nearly stationary in free controls. Shape (K, m).
+        """Return multipliers of the path equalities that make the Hamiltonian almost stationary in the free controls.
 
         Args:
             free: Which controls are off their bounds. Shape (K, nu), bool.
@@ -127,7 +127,7 @@ class Hamiltonian:
         return ca.Function(name, arguments, results, {"cse": True})
 
     def _solve(self) -> tuple[Any, str]:
-        """Return the function that computes optimal controls and multipliers, and the name of the solution method.
+        """Return the CasADi Function of optimal controls and multipliers, and the name of the solution method.
 
         Its arguments are (x, lam, t, T, p, bang, guess).
         """
@@ -195,7 +195,7 @@ class Hamiltonian:
 
 
 def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """Assemble the control from the smooth controls (first entries of ``w``) and the bang-bang controls ``bang``."""
+    """Assemble the control vector from smooth controls (first entries of ``w``) and bang-bang controls ``bang``."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
@@ -249,7 +249,7 @@ def nonzero_pattern(matrix: Any, symbols: list[Any]) -> Any:
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper bounds with all parameters set to one, to find which bounds are finite."""
+    """Return the lower and upper bounds with every parameter set to 1, to know which of the bounds are finite."""
     lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
     return lower, upper
 
@@ -339,7 +339,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
 def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Differentiate terminal cost plus multipliers times boundary constraints by parameters, horizon and end states."""
+    """Differentiate terminal cost plus weighted end constraints with respect to parameters, horizon and end states."""
     form = ham.form
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])

@@ -85,7 +85,7 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
 
 
 def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list[np.ndarray]:
-    """Return control derivatives of the Hamiltonian, and the path equalities, at K samples of an extremal.
+    """Return derivatives of the Hamiltonian in the controls, and the path equalities, at K samples of an extremal.
 
     These are dH/du (K, nu), the sum of absolute terms of dH/du (K, nu), d2H/du2 (K, nu, nu), the path equalities (K, m)
     and their Jacobian (K, m, nu).
@@ -102,7 +102,7 @@ def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list
 
 @dataclass(frozen=True)
 class Indirect:
-    """Indirect method: the equations of Pontryagin's minimum principle, solved by multiple or backward shooting.
+    """Indirect method, which solves the equations of Pontryagin's minimum principle by multiple or backward shooting.
 
     Attributes:
         segments: Number of segments, distributed over the arcs between switches of bang-bang controls.
@@ -151,7 +151,7 @@ class Indirect:
 
 
 class PreparedIndirect:
-    """A problem with its Hamiltonian system, derived once for repeated solves by the indirect method.
+    """A problem and its Hamiltonian system, derived once for repeated solves by the indirect method.
 
     Attributes:
         formulation, hamiltonian, boundary: The derived system. seconds: Wall time of the derivation.
@@ -280,7 +280,7 @@ class PreparedIndirect:
         note: str,
         seconds: float,
     ) -> Solution:
-        """Return the solution of the problem from the last Newton iterate; reject it if H is not minimal along it."""
+        """Return the solution from the last Newton iterate; reject one that does not minimise the Hamiltonian."""
         form, ham = self.formulation, self.hamiltonian
         y, inputs, switches, horizon = self.boundary.unpack(root.unknowns, arcs, data)
         segments = self._segments(y, inputs, bounds)
@@ -347,7 +347,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return initial values and data of all shooting segments, each split where a control reaches a bound."""
+        """Return start values and data of all shooting segments, which are split where a control reaches a bound."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 

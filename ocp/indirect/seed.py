@@ -23,7 +23,7 @@ from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Criteria by which a direct solution (seed) is rejected; they are tolerant because seeds may be coarse.
+    """Criteria by which a direct solution is rejected as an initial guess (seed), which may be coarse.
 
     Attributes:
         inside: Distance from both bounds, relative to their range, beyond which a control is inside them.
@@ -70,7 +70,7 @@ class ControlArcs:
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Return the bang-bang arcs between the sign changes of the switching functions dH/du of a direct solution.
+    """Return the bang-bang arcs of a direct solution, between the sign changes of its switching functions dH/du.
 
     Where dH/du > 0, the lower bound is active.
 
@@ -111,7 +111,7 @@ def read_arcs(
 
 
 def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control bounds under which a seed was computed, which may differ from ``bounds``. Shape (nu,) each."""
+    """Return the control bounds under which a direct solution (seed) was computed. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
@@ -161,7 +161,7 @@ def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.n
 
 
 def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: Solution) -> None:
-    """Raise SolveError if a control switches repeatedly within the width of the seed's mesh intervals."""
+    """Raise SolveError if a control of a direct solution (seed) switches in several successive mesh intervals."""
     width = 1.5 * float(np.max(np.diff(seed.control_interpolant.breaks)))
     for j, index in enumerate(ham.linear):
         label = ham.form.control_labels[index]
@@ -206,7 +206,7 @@ def read_unknowns(
 
 
 def sample_seed(seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states, costates and controls of a direct solution at K fractions of its horizon. Shape (K, size) each."""
+    """Return states, costates and controls of a direct solution at K fractions of the horizon. Shape (K, size) each."""
     lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in stack(seed.costates).T])
     return seed.state_interpolant(fractions), lam, seed.control_interpolant(fractions)
 

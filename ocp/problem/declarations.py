@@ -99,7 +99,7 @@ class Constraint:
         return int(self.expression.numel())
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError if expression, bounds, unit and tolerance do not match; see :meth:`Declarations.check`."""
+        """Raise ProblemError if expression, bounds, unit and tolerance of the constraint are inconsistent."""
         what = f"constraint {self.name!r}"
         way = () if self.way is None else (self.way,)
         _require_columns(symbols, self.size, what, self.expression, self.lower, self.upper, *way)
@@ -124,7 +124,7 @@ class Horizon:
     fixed: bool
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError if symbol, bounds or guess of the horizon are invalid; see :meth:`Declarations.check`."""
+        """Raise ProblemError if the symbol, the bounds or the guess of the horizon are invalid."""
         _require(isinstance(self.fixed, bool), "horizon")
         _require_columns(symbols, 1, "horizon", self.symbol, self.lower, self.upper)
         _require(self.guess is None or bool(np.isfinite(float(self.guess))), "horizon")
@@ -172,7 +172,7 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError about a variable of this kind if its name is invalid, reserved or already used."""
+        """Raise ProblemError if a new variable's name is invalid, reserved or used; messages begin with ``kind``."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
@@ -182,7 +182,7 @@ class Declarations:
                 raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if the name of a new constraint is invalid or used; error messages begin with ``kind``."""
+        """Raise ProblemError if the name of a new constraint is invalid or used; messages begin with ``kind``."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
@@ -213,7 +213,7 @@ class Declarations:
             self.horizon.check(symbols)
 
     def _check_variables(self, symbols: Any) -> None:
-        """Check sizes, guesses, scales and units of states, controls and parameters."""
+        """Raise ProblemError if a state, control or parameter has a wrong size, guess, scale or unit."""
         bounded = ("symbol", "lower", "upper")
         for pool, needed in (("parameters", ("symbol",)), ("controls", bounded), ("states", (*bounded, *ENDS))):
             for name, variable in getattr(self, pool).items():
@@ -225,7 +225,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Check sizes and types of dynamics, signals and cost, and that start values have permitted symbols only."""
+        """Raise ProblemError if dynamics, symbols at the start, signals or cost have a wrong size or type."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)
@@ -240,7 +240,7 @@ class Declarations:
             _require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
 
     def __str__(self) -> str:
-        """Return a text with one line for each declared state, control, parameter, constraint and other entry."""
+        """Return a text with one line for each declaration, such as that of a state or of a constraint."""
         lines = ["  horizon      not declared" if self.horizon is None else f"  horizon      {self.horizon}"]
         for state in self.states.values():
             ends = [f"; {end} {text}" for end in ENDS if (text := column_text(getattr(state, end))) != "nan"]
@@ -269,7 +269,7 @@ PART_KINDS: dict[str, Any] = {
 
 
 def _require(condition: bool, what: str) -> None:
-    """Raise ProblemError, which names ``what`` as the inconsistent declaration, unless a condition holds."""
+    """Raise ProblemError with the name ``what`` of the inconsistent declaration if a condition does not hold."""
     if not condition:
         raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
 
@@ -281,7 +281,7 @@ def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
 
 
 def column_text(value: Any) -> str:
-    """Return a column of numbers or expressions as text; if all entries are equal, the text is that of one entry."""
+    """Return a column of numbers or expressions as text; a column of equal entries is written as one entry."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
             return shorten(str(value))

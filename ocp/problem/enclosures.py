@@ -42,7 +42,7 @@ from ocp.problem.values import identity
 
 
 class Enclosure(NamedTuple):
-    """Bounds of the values and slopes of expressions over intervals of their variable; -inf and inf if unbounded.
+    """Bounds of the values and slopes of expressions over intervals of their only variable; they may be infinite.
 
     Attributes:
         low, high: Bounds of the values. Shape (M, n) for M intervals and n expressions.
@@ -56,7 +56,7 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Evaluator of bounds of the values and slopes of expressions of one scalar symbol over intervals of the symbol.
+    """Evaluator that bounds the values and slopes of expressions of one scalar symbol over intervals of the symbol.
 
     The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
     negative counts where it is real.
@@ -114,7 +114,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; ``exponent``, if given, is constant."""
+    """Return the partial derivatives of an operation as an SX function; if ``exponent`` is given, it is constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -137,7 +137,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return bounds of the value and slope of fmin or fmax; if the operands' ranges overlap, both slopes count."""
+    """Return bounds of the value and slope of fmin or fmax, from both operands where their ranges overlap."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     either = np.minimum(x.slope.low, y.slope.low), np.maximum(x.slope.high, y.slope.high)
@@ -232,7 +232,7 @@ class PrescribedMotion:
                 self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the prescribed motion can at most move the bodies of given pairs during time intervals.
+        """Return bounds of how far prescribed motion moves the bodies of given pairs within time intervals.
 
         Args:
             pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).
@@ -269,7 +269,7 @@ class PrescribedMotion:
 
 
 def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame that depends only on time as an expression of time, with numbers in place of the parameters.
+    """Return the pose of a frame as an expression of time alone, with numbers in place of the parameters.
 
     Raise ProblemError if the frame also depends on states.
     """
@@ -283,7 +283,7 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the matrix that maps a body's pose (12 numbers) to the corners of the body's bounding box in world.
+    """Return the matrix that maps the pose of a body (12 numbers) to the corners of its bounding box, both in world.
 
     Shape (3 C, 12) for C corners. ``core`` are the points of the body in the frame.
     """

@@ -39,7 +39,7 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a value as a column of expressions of ``known`` symbols; with ``finite``, constants must be finite."""
+        """Convert a value to a column of expressions in the ``known`` symbols; ``finite`` requires finite constants."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
@@ -64,7 +64,7 @@ class ExpressionReader:
         return expression
 
     def column(self, what: str, value: Value, size: int, default: float) -> Any:
-        """Return a user value, or ``default`` for None, as a column of parameter expressions. Shape (size, 1)."""
+        """Convert a value, or ``default`` for None, to a column of expressions of parameters. Shape (size, 1)."""
         if value is None:
             return self.symbols(ca.DM.ones(size, 1) * default)
         if is_symbolic(value):
@@ -79,7 +79,7 @@ class ExpressionReader:
         return ca.densify(ca.vec(expression))
 
     def bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:
-        """Return lower and upper bounds as columns of ``size`` entries; a bound that is None becomes infinite."""
+        """Convert lower and upper bounds to columns of ``size`` entries; a bound that is None becomes infinite."""
         low = self.column(f"{what}: lower", lower, size, -np.inf)
         high = self.column(f"{what}: upper", upper, size, np.inf)
         for label, value in (("lower", lower), ("upper", upper)):
@@ -99,7 +99,7 @@ class ExpressionReader:
         tolerance: Value,
         during: Value = None,
     ) -> Constraint:
-        """Return a constraint on an expression that contains only ``known`` symbols; errors name its ``kind``.
+        """Return a constraint of a given kind on an expression that contains only the symbols ``known``.
 
         Bounds that contain the time become part of the expression: e <= b of e - b <= 0. ``during`` are the first and
         the last time of a window; outside, the expression is replaced by a number inside the bounds.
@@ -133,12 +133,12 @@ class ExpressionReader:
         return Constraint(name, vector, low, high, unit, tolerances)
 
     def _changes_in_time(self, what: str, bound: Value) -> bool:
-        """Return whether a bound contains the time."""
+        """Return whether a bound depends on the time."""
         column = stack_column(what, bound) if is_symbolic(bound) else None
         return isinstance(column, self.symbols) and bool(ca.depends_on(column, self.time))
 
     def _inside_window(self, what: str, vector: Any, bounds: tuple[Any, Any], during: Value) -> Any:
-        """Return an expression that equals a given one inside a time window, and a value within the bounds outside."""
+        """Return an expression that equals a given one in a time window, and a number within the bounds elsewhere."""
         if not isinstance(during, tuple | list) or len(during) != 2:
             raise ProblemError(f"{what}: during must be two times, not {during!r}", name="during", value=during)
         begin, end = (self.column(f"{what}: during", part, 1, np.nan) for part in during)
@@ -179,7 +179,7 @@ class ExpressionReader:
 
 
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
-    """Return the number of entries of a variable: the given size, or the common size of its values (1 for scalars)."""
+    """Return the number of entries of a variable: the given size, or the common size of its bounds, guess and so on."""
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
@@ -195,12 +195,12 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
 
 
 def _columns(array: np.ndarray) -> int:
-    """Return the number of entries of a value, or of each sample of a table (M, n) with several columns."""
+    """Return the number of entries of a value; for a table (M, n) of several samples, the number n of columns."""
     return int(array.shape[1] if array.ndim == 2 and min(array.shape) > 1 else array.size)
 
 
 def read_positive(what: str, value: Value, size: int, *, scale: bool = False) -> np.ndarray | None:
-    """Return a positive number for each of ``size`` entries, given one for all or each; None for None. Shape (size,).
+    """Return ``size`` positive numbers, given one number for all entries or one for each; None for None. Shape (size,).
 
     Those of a ``scale`` are finite, or nan where the scale is unknown.
     """
@@ -215,7 +215,7 @@ def read_positive(what: str, value: Value, size: int, *, scale: bool = False) ->
 
 
 def check_guess(what: str, guess: Any, size: int) -> None:
-    """Raise ProblemError unless a guess is None, a function, or finite: a number, one per entry, or samples (M, n)."""
+    """Raise ProblemError unless a guess is None, a function, a finite number or a finite array of a suitable size."""
     if guess is None or callable(guess):
         return
     array = table(f"{what}: guess", guess)

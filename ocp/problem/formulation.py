@@ -32,7 +32,7 @@ Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a
 
 @dataclass(frozen=True)
 class Rows:
-    """Scalar constraints (rows) of one kind: path, start or end constraints, or those that only the audit checks.
+    """Scalar constraints (rows) of one kind: path, start or end constraints, or constraints that only the audit checks.
 
     Attributes:
         expression: Shape (m, 1), in the symbols of the formulation.
@@ -96,7 +96,7 @@ class BoundTable:
 
     @cached_property
     def _pullback(self) -> Any:
-        """CasADi Function of :meth:`pullback`: the transposed Jacobian of the bounds times their multipliers."""
+        """CasADi Function of the transposed Jacobian of the bounds times multipliers; see :meth:`pullback`."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)
@@ -219,16 +219,16 @@ class Formulation:
         return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
     def point_data(self, fractions: np.ndarray) -> np.ndarray:
-        """Return horizon fraction and signals at K points, arguments of :meth:`point_function`. Shape (1 + nw, K)."""
+        """Return horizon fractions and signals of K points, as :meth:`point_function` takes them. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the signals, or their time derivatives of a given order, at M times (s). Shape (M, nw)."""
+        """Return the signals (known functions of time), or their time derivatives, at M times (s). Shape (M, nw)."""
         times = np.ravel(times).astype(float)
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
     def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
-        """Evaluate the signals for :meth:`signals_at`; times are bytes because the cache needs hashable arguments."""
+        """Evaluate the signals at times, which are given as bytes because the cache needs hashable arguments."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -242,7 +242,7 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """Horizon in seconds if the problem has signals (known functions of time), which fix the horizon; else 1."""
+        """Horizon, s, of a problem with signals (known functions of time), which require a fixed horizon; else 1."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
@@ -391,7 +391,7 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the scalar constraints of one kind, such as "path".
+        """Return all scalar constraints of one kind, such as "path" or "end".
 
         ``end`` is 0 for constraints at the start and 1 at the end, where signals are replaced by their values; else
         None.
@@ -475,7 +475,7 @@ def labels(pool: dict[str, Any]) -> tuple[str, ...]:
 
 
 def units(declared: Declarations) -> dict[str, str]:
-    """Return the units of states, controls and constraints by name; "" if two of the same name have different units."""
+    """Return the units of states, controls and constraints by name; "" for a name that has different units."""
     units_of: dict[str, set[str]] = {}
     for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end, declared.watch):
         for name, item in pool.items():

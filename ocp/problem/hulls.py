@@ -67,7 +67,7 @@ class Hull:
 
     @cached_property
     def kind(self) -> int:
-        """Key of hulls that are evaluated together: 0 for boxes, else the point count rounded up to a power of two."""
+        """Key by which hulls are evaluated together: 0 for boxes, else the point count rounded up to a power of 2."""
         return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
@@ -88,7 +88,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """Pairs of bodies that are evaluated together because the kinds (see `Hull.kind`) of their hulls are the same.
+    """Pairs of bodies that are evaluated together because their hulls are of the same kinds (see `Hull.kind`).
 
     Attributes:
         has: Whether a pair is in this group. row: Its index in the group. Shape (n,) each.
@@ -133,7 +133,7 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the direction from the first to the second body, the gap and the nearest points of each pair.
+        """Return, for each pair, the unit vector from the first to the second body, the gap and the nearest points.
 
         Directions (unit vectors) and points are in the reference frame of the pair. Shapes (K, 3), (K,), m, and (K, 2,
         3), m.
@@ -187,9 +187,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return R pairs of shapes to evaluate for K pairs of bodies: for each its places in `pair` and in `rows`.
+        """Return R pairs of shapes to evaluate: the index of each one's pair of bodies in `pair`, its own in `rows`.
 
-        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
+        The first of them are the K pairs of bodies in `pair`; then come the shapes that cover these bodies.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -230,7 +230,7 @@ class SeparatingDirections(NamedTuple):
 
 
 class BodyPairs:
-    """Evaluator of the distances between pairs of bodies, which smaller shapes may cover; see `CoveredPairs`."""
+    """Evaluator of the distances between pairs of bodies, each of which may be covered by several smaller shapes."""
 
     def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
         self._covered = CoveredPairs(pairs, covers)
@@ -253,7 +253,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs of bodies at all samples, as lower bounds above `near`. Shape (M, n), m.
+        """Return the distances of all body pairs at all samples; those above `near` are lower bounds. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -278,7 +278,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of pairs of bodies at given samples, as lower bounds above `near`. Shape (K,), m."""
+        """Return the distances of body pairs at given samples; those above `near` are lower bounds. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -294,7 +294,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return separating directions, distances (K,), m, and closest points (K, 2, 3), m, of uninflated bodies."""
+        """Return separating directions, distances (K,), m, and closest points (K, 2, 3), m, of the uninflated hulls."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -319,7 +319,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Group the pairs `rows` by hull kind; yield each group, and its pairs' places in `rows` and in the group."""
+        """Yield the groups of the pairs `rows` by kinds of hulls, with their indices in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -327,7 +327,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Group pairs (n, 3), given by the indices of two bodies and of a frame (-1: the world), by kinds of hulls."""
+    """Group pairs (n, 3) of bodies by the kinds of the hulls; a pair is two bodies and a frame (-1: the world)."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -335,7 +335,7 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return the poses of F frames from M samples of rotation matrices, by columns, and positions. Shape (M, 12 F).
+    """Return the poses of F frames from samples (M, 12 F) of rotation matrices, column by column, and positions.
 
     The world is added as the last frame.
     """
@@ -346,7 +346,7 @@ def frames_of(placements: np.ndarray) -> Frames:
 
 
 def _normal(first: Hull, second: Hull) -> np.ndarray:
-    """Return the half-space normal of a pair, directed from first to second body; zero if neither is a half-space."""
+    """Return a pair's half-space normal, directed from the first to the second body; zero if there is no half-space."""
     return first.normal if first.normal.size else -second.normal if second.normal.size else np.zeros(3)
 
 
@@ -433,7 +433,7 @@ class Separation:
 
     @property
     def bodies(self) -> tuple[Hull, ...]:
-        """Hulls of all bodies of the declaration, in the order of their indices."""
+        """Hulls of all bodies of the separation constraint, in the order of their indices."""
         return tuple(self.hulls.values())
 
     @property
@@ -451,7 +451,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Check the pairs of shapes that cover pairs of bodies, and return them by the index of the covered pair."""
+    """Check the pairs of bodies that together contain another pair; return them keyed by the index of that pair."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:

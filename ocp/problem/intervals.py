@@ -55,7 +55,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 def interpret(
     function: Any, inputs: Sequence[Value], constant: Callable[[float], Value], apply: Callable[..., Value]
 ) -> list[Value]:
-    """Evaluate an SX function of one output in another arithmetic, such as interval arithmetic; return the entries.
+    """Evaluate the single output of an SX function in another arithmetic, such as interval arithmetic.
 
     Args:
         function: Function of scalars.
@@ -114,7 +114,7 @@ def bounded_where(known: Any, x: Interval, low: Any = -np.inf, high: Any = np.in
 
 
 def _add(x: Interval, y: Interval) -> Interval:
-    """Return the range of a sum, or that of an if_else, which casadi writes as a sum of both branches."""
+    """Return the range of a sum. A sum may represent an if_else, which casadi writes as a sum of both branches."""
     if x.part is not None and y.part is not None:
         (test, yes), (opposite, no) = x.part, y.part
         if test.negates is opposite or opposite.negates is test:
@@ -123,7 +123,7 @@ def _add(x: Interval, y: Interval) -> Interval:
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
-    """Return the range of if_else: `yes` where the test always holds, `no` where it always fails, else both."""
+    """Return the range of if_else: `yes` where the test always holds, `no` where it always fails, else the union."""
     holds, fails = decided_masks(test)
     either = np.minimum(yes.low, no.low), np.maximum(yes.high, no.high)
     return bounded_where(holds, yes, *bounded_where(fails, no, *either)[:2])
@@ -207,7 +207,7 @@ def _contains_multiple(x: Interval, first: float, step: float) -> Any:
 
 
 def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
-    """Return the interval rule of sine or cosine, whose maximum is at the angle `crest`."""
+    """Return the interval extension of sine or cosine, whose maximum is at the angle `crest`."""
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
@@ -225,7 +225,7 @@ def _tangent(x: Interval) -> Interval:
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Return the range of atan2(y, x): from its values at the ends of both intervals, or a full turn at its jump."""
+    """Return the range of atan2(y, x) from the ends of both intervals, or a full turn where atan2 may jump."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     half = float(np.nextafter(np.pi, 4))
     return bounded_where((x.low > 0) | (y.low > 0) | (y.high < 0), result, -half, half)
@@ -252,13 +252,13 @@ def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tupl
 
 
 def _modulo(x: Interval, y: Interval) -> Interval:
-    """Return the range of fmod: x minus a multiple of y, with the sign of x."""
+    """Return the range of fmod(x, y): the remainder of the division x / y, with the sign of x."""
     largest = np.minimum(_absolute(y).high, _absolute(x).high)
     return _reduce(x, y, np.trunc, np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0))
 
 
 def _remainder(x: Interval, y: Interval) -> Interval:
-    """Return the range of the remainder: x minus the nearest integer multiple of y."""
+    """Return the range of the remainder: the difference of x from the nearest integer multiple of y."""
     half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
     return _reduce(x, y, np.rint, -half, half)
 
@@ -294,7 +294,7 @@ def _and(x: Interval, y: Interval) -> Interval:
 
 
 def _step_rule(function: Callable[[Any], Any]) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing step function, whose integer values need no widening for rounding."""
+    """Return the interval extension of an increasing step function, whose integer values have no rounding errors."""
     return lambda x: Interval(function(x.low), function(x.high))
 
 

@@ -120,7 +120,7 @@ def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most ``count`` random states, and their time derivatives, which are finite. Shape (K, nx) each."""
+    """Return at most ``count`` random states and their time derivatives, which are finite. Shape (K, nx) each."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))

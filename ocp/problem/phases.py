@@ -165,7 +165,7 @@ class Phases(Problem):
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
-        """Return the states and controls of a phase by their names in it, and the shared free parameters."""
+        """Return the states and controls of a phase by their names within the phase, and the shared free parameters."""
         pool = {**self.declared.states, **self.declared.controls}
         shared = {name: own for name, own in pool.items() if name.partition(".")[0] not in self.declared.phases}
         return shared | parts_of_phase(self[phase].name, pool)
@@ -278,7 +278,7 @@ class _PhaseInserter:
         self.new.append(new)
 
     def _substitute(self, expression: Any) -> Any:
-        """Return an expression of the phase in the symbols of the whole problem."""
+        """Convert an expression of the phase to the symbols of the whole problem."""
         used = {identity(symbol) for symbol in ca.symvar(expression)}
         pairs = [
             (old, self.whole.symbols(new))
@@ -291,7 +291,7 @@ class _PhaseInserter:
         return self.whole.symbols(ca.densify(placed))
 
     def _column(self, values: Any) -> Any:
-        """Return a column of expressions in the symbols of the whole problem; entries that are numbers stay numbers."""
+        """Convert a column of expressions of the phase to the symbols of the whole problem; numbers stay numbers."""
         entries = ca.vertsplit(values)
         numbers = [not ca.symvar(entry) for entry in entries]
         placed = [

@@ -37,7 +37,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Decorate a declaring method of Problem so that its errors name the declared state, constraint or other item."""
+    """Decorate a method of Problem that declares an item, so that errors of the method name the item."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -55,7 +55,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Decorate a function that builds problems: each problem stores the builder's name and arguments for a rebuild."""
+    """Decorate a function that builds a problem, so that the problem stores the function's name and arguments."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -101,14 +101,14 @@ class Problem:
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the problem, with new symbols, from data of :meth:`__getstate__`; raise ProblemError if damaged."""
+        """Restore the problem with new symbols from data of `__getstate__`; raise ProblemError if they are damaged."""
         self.name, self.symbols, self.time, self.declared = from_record(state, RECORD_KINDS)
         self.declared.check(self.symbols)
         self.formulated = self.origin = None
 
     @classmethod
     def from_record(cls, state: dict[str, Any]) -> Problem:
-        """Return the problem from data that :meth:`__getstate__` has returned."""
+        """Rebuild a problem from the data that :meth:`__getstate__` has returned."""
         problem = cls.__new__(cls)
         problem.__setstate__(state)
         return problem
@@ -174,7 +174,7 @@ class Problem:
         scale: Value = None,
         rate: Value = None,
     ) -> Any:
-        """Declare a control and return its symbol. Shape (n, 1). Arguments as for :meth:`state`.
+        """Declare a control and return its symbol. Shape (n, 1). The arguments are those of :meth:`state`.
 
         With ``rate``, the largest absolute rate of change, it is a state, and the control is its rate, ``NAME rate``.
         """
@@ -279,7 +279,7 @@ class Problem:
         return self.declared.at_start[declared.name]
 
     def dynamics(self, state: Any, derivative: Value) -> None:
-        """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
+        """Declare ``d state / dt = derivative`` (n, 1), which may contain states, controls, parameters and time."""
         variable = self._find(self.declared.states, state, "dynamics")
         if variable.name in self.declared.dynamics:
             raise ProblemError(f"state {variable.name!r}: dynamics declared twice", name=variable.name)
@@ -302,7 +302,7 @@ class Problem:
         unit: str = "",
         tolerance: Value = None,
     ) -> None:
-        """Declare ``lower <= expression <= upper`` at all times; equal bounds make an equality.
+        """Declare the path constraint ``lower <= expression <= upper`` at all times; equal bounds make an equality.
 
         Args:
             lower, upper: Bounds; expressions of parameters and of the time are allowed.
@@ -316,12 +316,12 @@ class Problem:
 
     @_about_its_name
     def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
-        """Declare ``lower <= expression <= upper`` at the start."""
+        """Declare the constraint ``lower <= expression <= upper`` at the start of the motion."""
         self.declared.start[name] = self._constraint("start", name, expression, (lower, upper), unit)
 
     @_about_its_name
     def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
-        """Declare ``lower <= expression <= upper`` at the end; the expression may contain ``at_start`` symbols."""
+        """Declare the constraint ``lower <= expression <= upper`` at the end; it may contain ``at_start`` symbols."""
         known = list(self.declared.at_start.values())
         self.declared.end[name] = self._constraint("end", name, expression, (lower, upper), unit, known=known)
 
@@ -338,7 +338,7 @@ class Problem:
         unit: str = "",
         tolerance: Value = None,
     ) -> None:
-        """Declare ``lower <= expression <= upper`` at all times for the audit to check; no method enforces it.
+        """Declare ``lower <= expression <= upper`` at all times, which only the audit checks and no solver enforces.
 
         Use it for conditions that follow from the other constraints up to accumulated errors, such as the position of a
         tip whose velocity is constrained.
@@ -376,7 +376,7 @@ class Problem:
         covers: Mapping[int, Any] | None = None,
         assumed: Mapping[str, str] | None = None,
     ) -> None:
-        """Declare minimum distances between bodies, which the audit proves at all times and no method enforces.
+        """Declare minimum distances between bodies, which the audit proves at all times and no solver enforces.
 
         Args:
             name: Unique among the constraints.
@@ -405,7 +405,7 @@ class Problem:
         self.declared.apart[name] = separation
 
     def minimize(self, running: Value = 0, terminal: Value = 0) -> None:
-        """Declare the cost: ``integral of running dt + terminal``. ``terminal`` may use ``at_start`` symbols."""
+        """Declare the cost ``integral of running dt + terminal``; ``terminal`` may contain ``at_start`` symbols."""
         if self.declared.running is not None:
             raise ProblemError(f"problem {self.name!r}: the cost is declared twice")
         self.declared.running, self.declared.terminal = self._costs(running, terminal)
@@ -423,7 +423,7 @@ class Problem:
         return costs
 
     def check(self) -> None:
-        """Raise ProblemError if the declaration is incomplete: no state, a state without dynamics, no horizon."""
+        """Raise ProblemError if the problem is incomplete: it has no state, a state without dynamics, or no horizon."""
         if not self.declared.states:
             raise ProblemError(f"problem {self.name!r} has no state; declare one with problem.state(...)")
         for name in self.declared.states:
@@ -433,7 +433,7 @@ class Problem:
             raise ProblemError(f"problem {self.name!r} has no horizon; declare problem.horizon(...)", name="horizon")
 
     def __str__(self) -> str:
-        """Return a text with one line for each declared state, control, parameter, constraint and other entry."""
+        """Return a text with one line for each declaration, such as that of a state or of a constraint."""
         return f"Problem {self.name!r}\n{self.declared}"
 
     def __repr__(self) -> str:
@@ -494,7 +494,7 @@ class Problem:
         known: Sequence[Any] = (),
         during: Value = None,
     ) -> Constraint:
-        """Return a new constraint, whose expression may contain the symbols of path constraints and ``known`` ones."""
+        """Return a new constraint, whose expression may contain ``known`` symbols and those of path constraints."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         symbols, options = [*self._inner(), *known], {"unit": unit, "tolerance": tolerance, "during": during}
         return self._reader.constraint(kind, name, expression, symbols, bounds=bounds, **options)

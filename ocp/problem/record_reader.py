@@ -146,12 +146,12 @@ class FunctionReader:
 
 
 def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
-    """Return a matrix with a sparsity pattern from its nonzero entries."""
+    """Build a matrix of a given sparsity pattern from its nonzero entries."""
     return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
 
 
 def matrices_from(patterns: Sequence[Any], entries: Sequence[Any], kind: Any) -> list[Any]:
-    """Return matrices with given sparsity patterns from the nonzero entries of all of them, one after the other."""
+    """Build matrices of given sparsity patterns from one list of the nonzero entries of all matrices."""
     ends = np.cumsum([0, *(pattern.nnz() for pattern in patterns)]).tolist()
     return [from_entries(pattern, entries[a:b], kind) for pattern, (a, b) in zip(patterns, pairwise(ends), strict=True)]
 
@@ -162,7 +162,7 @@ def _nonzeros(matrix: Any) -> list[Any]:
 
 
 def _declared_entries(record: Mapping[str, Any]) -> int:
-    """Return how many matrix entries, zeros included, the arguments and results of a recorded function have."""
+    """Return the number of matrix entries, zeros included, of the arguments and results of a recorded function."""
     if record["kind"] == "operations":
         return sum(abs(shape[0] * shape[1]) for shape in (*record["inputs"], *record["outputs"]))
     sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
@@ -175,7 +175,7 @@ def _entries(function: Any) -> int:
 
 
 def _call(callee: Any, entries: list[Any]) -> list[Any]:
-    """Call a function; its arguments, and its results, are each one flat list of the nonzeros of several matrices."""
+    """Call a function on one list of the nonzeros of all arguments; return the nonzeros of all results as a list."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
     arguments = matrices_from([callee.sparsity_in(k) for k in range(callee.n_in())], entries, ca.MX)

@@ -43,7 +43,7 @@ class FunctionWriter:
         self._alive: list[Any] = []  # keeps functions alive: CasADi reuses the hash of a deleted one
 
     def write(self, function: Any) -> int:
-        """Write a function as a record if this has not been done, and return the number of the record.
+        """Write a function as a record unless it has been written before, and return the number of the record.
 
         Raises:
             ProblemError: The function, or one that it calls, cannot be written, such as a Python callback.
@@ -75,7 +75,7 @@ class FunctionWriter:
         return self._register(function.__hash__(), len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function that a recorded function merely calls with its own arguments, or None.
+        """Return the number of the function to which a recorded function merely passes its own arguments, or None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
@@ -93,7 +93,7 @@ class FunctionWriter:
         return int(rows[count, 1]) if passes and (patterns, results) == (record["inputs"], record["outputs"]) else None
 
     def _register(self, key: int, number: int) -> int:
-        """Store the number of the record of a function with a given hash, and return the number."""
+        """Store the number of a function's record under the hash of the function, and return the number."""
         self._numbers[key] = number
         return number
 
@@ -105,7 +105,7 @@ class FunctionWriter:
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Store the record of a function of one vector, and return its value for given entries of the vector."""
+        """Store the record of a function of one vector, and return the function's value for given vector entries."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
@@ -342,7 +342,7 @@ def _interpolant_record(function: Any, kind: str) -> dict[str, Any]:
 
 
 def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
-    """Return the record of a casadi integrator, whose differential equations are the function number `oracle`."""
+    """Return the record of a casadi integrator, whose differential equations are the recorded function `oracle`."""
     kinds = dict(INTEGRATOR_OPTIONS.values())
     names = {"Integrator::t0": float, "Integrator::tout": [float], "Integrator::nfwd": int, "Integrator::nadj": int}
     numbers = _fields(function, {**kinds, **names})

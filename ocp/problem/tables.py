@@ -23,7 +23,7 @@ DEGREE = 3
 
 
 class Table:
-    """A table of data as a function of one or several numbers or expressions; :func:`table` builds it.
+    """Spline function of one or several arguments that interpolates a table of data; :func:`table` builds it.
 
     Attributes:
         points: Points of each argument, increasing. Shape (n,) each.
@@ -58,7 +58,7 @@ class Table:
 
 
 def table(points: Any, values: Any) -> Table:
-    """Return a table of data as a function with two continuous derivatives, for SX and MX problems.
+    """Return a spline function, with two continuous derivatives, that interpolates a table of data.
 
     Args:
         points: Points of the argument, increasing, (n,); for several arguments a tuple of such arrays.
@@ -79,7 +79,7 @@ def table(points: Any, values: Any) -> Table:
 
 
 def _weights(points: np.ndarray, x: Any) -> Any:
-    """Return the weights by which the spline at the expression ``x`` combines the values at n points. Shape (n, 1).
+    """Return the weights of the data at n points in the value of the interpolating spline at ``x``. Shape (n, 1).
 
     The coefficients of the piece that contains ``x`` are the first ones plus the differences at the knots passed, whose
     derivatives vanish.

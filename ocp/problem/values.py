@@ -104,7 +104,7 @@ def middle_horizon(low: float, high: float) -> float:
 
 
 def dependence(expression: Any, symbols: Any) -> np.ndarray:
-    """Return which entries of a column of expressions contain which of a column of symbols. Shape (m, n), bool."""
+    """Return which entries of a column of expressions contain which symbols of a column. Shape (m, n), bool."""
     pattern = np.asarray(ca.DM(ca.jacobian_sparsity(expression, symbols), 1).full()) != 0
     return np.asarray(pattern.reshape(expression.numel(), symbols.numel()))
 

@@ -138,6 +138,20 @@ def test_a_tighter_tolerance_takes_more_intervals_and_brings_the_cost_nearer() -
     assert abs(tight.cost - exact) < abs(loose.cost - exact)
 
 
+def test_a_plan_on_the_first_mesh_is_not_solved_again_unless_a_parameter_differs() -> None:
+    problem, x, u = plant("parameter", initial=1.0)
+    target = problem.parameter("target")
+    problem.dynamics(x, u)
+    problem.minimize(running=(x - target) ** 2 + u**2)
+    mesh = Collocation(12)
+    known = solve(problem, mesh, parameters={"target": 0.0})
+    same, other = (refine(problem, mesh, guess=known, parameters={"target": value}) for value in (0.0, 0.5))
+    assert np.array_equal(same.variables, known.variables)
+    assert same.refinement is not None
+    assert other.cost == pytest.approx(solve(problem, mesh, parameters={"target": 0.5}).cost, rel=1e-6)
+    assert other.cost != pytest.approx(known.cost, rel=1e-2)
+
+
 def test_nothing_is_refined_that_is_good_already() -> None:
     solution = refine(energy(), Collocation(2, 4), tolerance=1e-8)
     assert solution.refinement is not None

@@ -56,8 +56,8 @@ _LOCK = threading.RLock()
 
 
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call a function with a task, given as JSON text, and if `with_guess` with the result of a similar task; return
-    the payload of its result, or of its exception. Raise WorkerFailure if the disk is full.
+    """Call a function with a task (JSON text) and, if `with_guess`, the result of a similar task as initial guess.
+    Return its result, or the exception that it raised, as a `Payload`; raise WorkerFailure if the disk is full.
     """
     with _LOCK:
         began = time.perf_counter()
@@ -81,14 +81,14 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
 
 
 def failure_payload(status: str, error: str, message: str) -> Payload:
-    """Return the payload that records why a task ended without a result."""
+    """Return the data to be stored for a task that ended without a result: its status and the error."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
     return Payload({"status": status, "error": error, "message": message, **empty})
 
 
 def message_of(error: BaseException) -> str:
-    """Return an exception's message, with the file and line of its origin unless it is an exception of this package."""
+    """Return the message of an exception, and the file and line of its origin unless this package raised it."""
     words = str(error).encode("utf-8", "replace").decode()
     if isinstance(error, DetailedError | ModelError):
         return words
@@ -105,7 +105,7 @@ _INPUTS: dict[str, str | None] = {}
 
 
 def cached(make: Function, *arguments: Any) -> Any:
-    """Return ``make(*arguments)``, such as a robot read from a file, which each worker computes only once.
+    """Return ``make(*arguments)``, for example a robot read from a file; each worker computes the value only once.
 
     The cache holds eight objects. Arguments are data like tasks, and `make` must return the same for the same
     arguments. If an argument names a file, a failed task is repeated when the batch is started after the file has
@@ -164,7 +164,7 @@ class EngineSettings:
 
 
 class Job(NamedTuple):
-    """A task to run, with its key, its JSON text, and the result of a similar task as initial guess (or None)."""
+    """Task to run: key, JSON text, and the result of a similar task as initial guess (None if there is none)."""
 
     key: str
     task: str
@@ -172,8 +172,8 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Outcome of a job: its key, the payload of its result (None if it must be sent again), and the number of ended
-    workers.
+    """Outcome of a job: key of the task, data of its result (None if the task must be sent again), and number of
+    workers that ended while they ran the task.
     """
 
     key: str
@@ -301,7 +301,7 @@ class Engine:
         return not self._running
 
     def free_slots(self) -> int:
-        """Return the number of idle threads of the workers, each of which can be sent one job.
+        """Return the number of idle threads of all workers, which is the number of jobs that can be sent now.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.
         """
@@ -422,7 +422,7 @@ class PendingTasks:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
     def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Queue a task to run alone, because its worker ended; record the task as killed if too many workers ended."""
+        """Queue a task whose worker ended, to run it alone; store it as killed if it has ended too many workers."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
@@ -448,7 +448,7 @@ class PendingTasks:
         return Job(key, self.texts[key], None if record is None else self.store.payload(record))
 
     def _neighbour(self, key: str) -> str | None:
-        """Follow the chain of similar tasks from a task; return the key of the first that succeeded, or None."""
+        """Return the key of the nearest predecessor of a task in its chain of similar tasks that succeeded, or None."""
         parent = self.parents[key]
         while parent is not None and self.results[parent].status != "done":
             parent = self.parents[parent]

@@ -42,7 +42,7 @@ DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of
 
 
 class Payload(NamedTuple):
-    """A result in the form in which workers send it: its record, and the contents of the record's files."""
+    """Result of a task in the form in which workers send it: a record of plain data, and the contents of its files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()
@@ -108,12 +108,12 @@ def canonical_text(value: Any, where: str) -> str:
 
 
 def key_of(text: str) -> str:
-    """Return the key of a task: the first 32 hexadecimal digits of the SHA-256 hash of its text."""
+    """Return the key of a task: the first 32 hexadecimal digits of the SHA-256 hash of the task's JSON text."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def pack_result(value: Any) -> Payload:
-    """Convert the result of a batch's function to a payload, which also states the cost and verdict of the result.
+    """Convert the value that a function returned for a task to a `Payload`, with the cost and verdict of the value.
 
     The cost is that of a plan or solution, the ``"cost"`` of a dictionary or that of the only plan in it, or the number
     itself. The verdict is the ``"verdict"`` of a dictionary, or whether the audit of the only plan passes; otherwise
@@ -146,7 +146,7 @@ def pack_result(value: Any) -> Payload:
 
 
 def unpack_result(payload: Payload) -> Any:
-    """Convert a payload back to the result given to :func:`pack_result`; raise ProblemError if a file is damaged."""
+    """Convert a `Payload` back to the value from which it was packed; raise ProblemError if a file is damaged."""
     value = json.loads(json.dumps(payload.record["value"]))
     try:
         for entry, file in zip(payload.record["files"], payload.files, strict=True):
@@ -213,7 +213,7 @@ class ResultStore:
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """Return the store of results that already exists in a folder; raise ProblemError if there is none of this
+        """Return the existing store of results in a folder; raise ProblemError if the folder has no store of this
         format.
         """
         path = checked_folder(folder)
@@ -238,7 +238,7 @@ class ResultStore:
 
     @classmethod
     def of(cls, folder: Any, function: str, version: str, chosen: bool) -> ResultStore:
-        """Return the store of the results of a function in a folder; create it if the folder is new or empty.
+        """Return the store for the results of a function in a folder; create the store if the folder is new or empty.
 
         `chosen` says whether the user chose the version; else it is that of the source.
 
@@ -286,7 +286,7 @@ class ResultStore:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder during a `with` block; if another process has locked the folder, wait for its release."""
+        """Lock the folder during a `with` block; if another process holds the lock, wait until it is released."""
         file = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o644)
         try:
             try:
@@ -306,7 +306,7 @@ class ResultStore:
     # ---- records -----------------------------------------------------------------------------------------------
 
     def read(self, key: str) -> dict[str, Any] | None:
-        """Return the record of a key, or None if the record is missing or incomplete; links are not followed."""
+        """Return the stored record with a key; None if it is missing, incomplete or reached by a symbolic link."""
         try:
             path = self._place(key)
             record: Any = None if path.parent.is_symlink() else load_json(path)
@@ -328,7 +328,7 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Write the files of a record and then the record itself; replace existing links of the same names."""
+        """Write the files of a record and then the record; replace symbolic links that have names of these files."""
         path = self._place(record["key"])
         for link in (path.parent, path, *(file_at(path, i) for i in range(len(files)))):
             if os.path.islink(link):
@@ -381,7 +381,7 @@ def finite(text: str) -> float:
 
 
 def file_at(place: Path, number: int) -> Path:
-    """Return the path of a stored plan or solution from the path of its record and the number, from 0, of the file."""
+    """Return the path of a stored plan or solution, from the path of the record and the file's index in it."""
     return place.with_suffix(f".{number}.npz")
 
 
@@ -450,8 +450,8 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return the result as a table row: ``COLUMNS``, entries of the task as ``task.NAME``, of its value as
-        ``result.NAME``.
+        """Return the result as a table row with the columns ``COLUMNS``, ``task.NAME`` for the entries of the task, and
+        ``result.NAME`` for those of the value.
 
         Longer entries of a task are given as JSON.
         """

@@ -142,7 +142,7 @@ def run_batch(
 
 
 def texts_of(tasks: Any) -> dict[str, str]:
-    """Return the canonical text of each distinct task by its key; raise ProblemError if `tasks` is no list of data."""
+    """Return the JSON texts of the distinct tasks by key; raise ProblemError unless `tasks` is a list of plain data."""
     if isinstance(tasks, str | bytes | dict):
         raise ProblemError(f"tasks must be a list of tasks, not one: {tasks!r}", name="tasks", value=tasks)
     texts: dict[str, str] = {}
@@ -243,7 +243,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
 
 
 def coordinates_of(task: Any, names: Sequence[str]) -> Array:
-    """Return the named numbers of a task as a point, to compute distances between tasks. Shape (n,)."""
+    """Return the numbers of a task with given names as a point, for distances between tasks. Shape (n,)."""
     parts = []
     for name in names:
         value = task.get(name) if isinstance(task, Mapping) else None
@@ -317,7 +317,7 @@ class Batch:
         return f'{counts}, first: {first.error or first.status}: {message}; run again with again="failed"'
 
     def check(self) -> None:
-        """Raise BatchError with a summary of the batch if a task failed, or crashed the processes that ran it."""
+        """Raise BatchError with a summary of the batch if a task failed or ended the processes that ran it."""
         if count := len(self) - self.counts.get("done", 0):
             raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
 
@@ -410,7 +410,7 @@ def entry(task: Any, name: str) -> Any:
 
 
 def uniform(values: list[Any]) -> list[Any]:
-    """Convert the values of a column to one type: booleans, numbers, or texts."""
+    """Convert the values of a table column to one type: booleans, numbers, or texts."""
     present = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in present):
         return values

@@ -25,7 +25,7 @@ from ocp.problem.values import Sampler
 
 @dataclass(frozen=True)
 class DataThresholds:
-    """Thresholds for implausible positions, jumps, sample times and signs of exchanged joints in a trajectory file.
+    """Thresholds beyond which data of a trajectory file are implausible: positions, jumps, times, exchanged joints.
 
     Attributes:
         wild: Relative to a limit, plus 1 rad or m: a position beyond it is unlikely to be in rad or m.
@@ -89,7 +89,7 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 
 @dataclass(eq=False)
 class _Samples:
-    """Times (M,) and samples (M, k) of joints that are being corrected, the limits of the joints, and faults found."""
+    """Times (M,) and joint samples (M, k) of a file while its faults are corrected, with joint limits and faults."""
 
     t: Array
     q: Array
@@ -231,7 +231,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below 1 s in which sample times are plausible, or "", and the highest joint speed for times in s.
+    """Return the unit below 1 s in which times are plausible ("" if none), and the highest speed for times in seconds.
 
     The speed is relative to the joint's limit, or to 1 without one. Times are plausible if the samples are at 10 kHz or
     less, and the fastest joint moves at 1 to 1000 % of its limit.
@@ -243,7 +243,7 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 
 def _convert_to_seconds(samples: _Samples) -> None:
-    """Convert times to s, and add a fault, if they are whole numbers so far apart that their unit must be smaller."""
+    """Convert times to s and add a fault if the times are whole numbers too far apart to be seconds."""
     t = samples.t
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return
@@ -305,7 +305,7 @@ def _worst_in_degrees(samples: _Samples, turning: list[int], margin: Array) -> i
 
 
 def _unwrap(samples: _Samples) -> list[Fault]:
-    """Remove jumps of the positions by full turns; return a fault for each such joint that has position limits.
+    """Remove jumps of joint positions by full turns; return a fault for each corrected joint that has limits.
 
     For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.
@@ -336,7 +336,7 @@ def _unwrap(samples: _Samples) -> list[Fault]:
 
 
 def _check_velocities(samples: _Samples) -> None:
-    """Convert the times if the velocities imply a smaller unit, and add faults for wrong velocities."""
+    """Convert the times if the velocities imply a smaller time unit, and add faults for wrong velocities."""
     t, q, v, names, faults = samples.t, samples.q, samples.v, samples.names, samples.faults
     if v is None or len(t) < 10:
         return
@@ -373,7 +373,7 @@ def _check_velocities(samples: _Samples) -> None:
 
 
 def _check_jumps(samples: _Samples) -> None:
-    """Add a fault for each joint that moves far more between two samples than between the samples around them."""
+    """Add a fault for each joint that moves far more between two samples than between neighbouring samples."""
     t, q, velocity = samples.t, samples.q, samples.velocity
     h, steps = np.diff(t), np.diff(q, axis=0)
     speeds, count = steps / h[:, None], len(h)

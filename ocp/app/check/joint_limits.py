@@ -117,7 +117,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
-    """Piecewise polynomials between breaks t (N + 1,), s; Bernstein coefficients (N, d + 1, n) enclose their values."""
+    """Piecewise polynomials of degree d for n joints: breaks (N + 1,), s, and Bernstein coefficients (N, d + 1, n)."""
 
     t: Array
     coefficients: Array
@@ -129,13 +129,13 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
-        """Return the values (M, n) at times (M,), clipped to the range of `t`; at a break, of the later polynomial."""
+        """Return values (M, n) at times (M,), clipped to the range of `t`; a break belongs to the later interval."""
         interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         begin, end = self.t[interval], self.t[interval + 1]
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return the polynomials' values (M, n) in given intervals (M,) at fractions (M,), 0 to 1, of their length."""
+        """Return values (M, n) of polynomials with given indices (M,) at fractions (M,), 0 to 1, of their intervals."""
         degree = self.coefficients.shape[1] - 1
         s = fraction[:, None]
         terms = (
@@ -232,7 +232,7 @@ class Motion:
         return self.position.derivative()
 
     def end_speeds(self) -> Array:
-        """Return the speeds of the joints at both ends, 0 for a joint that is at rest there. Shape (2, n).
+        """Return the absolute joint speeds at the start and the end, 0 for a joint that rests there. Shape (2, n).
 
         A motion of which only positions are known counts as at rest at an end if its mean speed in the interval there
         is at most the change of speed to the next interval, as under any constant acceleration or jerk from rest.
@@ -250,12 +250,12 @@ class Motion:
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Rounding errors of positions, velocities and accelerations: half of their last digits. Shape (n,) each."""
+        """Rounding errors of positions, velocities, accelerations: half a unit in the last digit. Shape (n,) each."""
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
     def quantity(self, name: str) -> MotionQuantity | None:
-        """Return a quantity along the motion, such as "velocity" or "jerk"; None if there are too few samples."""
+        """Return a quantity along the motion, such as "velocity" or "jerk"; None if the samples are too few for it."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
@@ -278,7 +278,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least possible maximum of a quantity, and of its negative, in each interval between samples.
+        """Return the least maxima of a quantity and its negative, by interval, over all motions through the samples.
 
         Acceleration: a motion through two samples needs the least acceleration if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -417,7 +417,7 @@ def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
 
 
 class _Side(NamedTuple):
-    """Largest values of one quantity of a joint towards its upper or lower limit, in each interval between samples.
+    """Largest values of a joint quantity towards the upper or the lower limit, in each interval between samples.
 
     Values (N,) and limit are multiplied by `sign`: 1 for the upper limit, -1 for the lower. They are at most what every
     motion through the samples needs; `eased` says that the interpolant violates the limit, but not every such motion.
@@ -431,7 +431,7 @@ class _Side(NamedTuple):
 
     @property
     def worst_value(self) -> float:
-        """Value that is nearest to the limit, or furthest beyond it, with its original sign."""
+        """Value that is nearest to the limit or farthest beyond it, with its original sign."""
         return self.sign * float(self.values.max())
 
 

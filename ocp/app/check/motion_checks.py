@@ -72,7 +72,7 @@ class Quantity:
 
 @dataclass(eq=False)
 class Findings:
-    """Table rows and faults that the checks of a trajectory find; each check appends its own."""
+    """Table rows and faults that the checks of a trajectory find; each check appends to them."""
 
     rows: list[Row] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
@@ -173,7 +173,7 @@ def torque_expression(machine: Machine, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
 
 
 def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
-    """Return times (K,), s, and positions, velocities and accelerations (K, n) of a motion for inverse dynamics."""
+    """Return times (K,), s, and joint positions, velocities and accelerations (K, n) to compute torques from."""
     t, h = motion.t, np.diff(motion.t)
     if motion.acceleration is None:
         if len(t) < 3:
@@ -217,7 +217,7 @@ def check_ground(findings: Findings, machine: Standing, motion: Motion, friction
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Integrate the motion of a floating base; return its configurations (M, base_size) at the samples, and table rows.
+    """Integrate the base motion; return base configurations (M, base_size) and table rows of displacement and rotation.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.
@@ -425,7 +425,7 @@ def check_path(
     times = np.append((motion.t[:-1, None] + steps).ravel(), motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
-        """Return positions and z axes of the tip at times (K,). Shape (K, 3) each."""
+        """Return the positions and the z axes of the tip at times (K,) of a motion. Shape (K, 3) each."""
         base_path = np.zeros((len(at), 0)) if bases is None else interpolate(at, motion.t, bases)
         if base_path.shape[1] == 7:
             base_path[:, 3:] /= np.linalg.norm(base_path[:, 3:], axis=1)[:, None]
@@ -461,7 +461,7 @@ def check_path(
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the required z axes (K, 3) of the tool at waypoint numbers (K,), interpolated at fractional numbers."""
+    """Return the z axes (K, 3) that the tool must have at waypoint indices (K,), interpolated between waypoints."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -470,7 +470,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Return distances of points (K, 3) from a polyline with corners (M, 3), and the closest points on the polyline.
+    """Return the distances of points (K, 3) from a polyline with corners (M, 3), and the closest points on it.
 
     The closest point is given by the number of the corner before it plus the fraction of the edge. Shape (K,) each.
     """

@@ -85,7 +85,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the trajectory, as a sentence whose subject the caller adds: "meets all checked requirements"."""
+        """Verdict on the trajectory as the predicate of a sentence, such as "meets all checked requirements"."""
         names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
         unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
@@ -207,7 +207,7 @@ class CheckTolerances:
 
 
 def _checked_machine(machine: Any) -> FixedBase | FreeFloating | Standing:
-    """Return a machine whose trajectories can be checked; a robot stands on a fixed base at the world's origin."""
+    """Return the machine to check; a robot is put on a fixed base, and other types raise ProblemError."""
     if isinstance(machine, Robot):
         return FixedBase(machine)
     if isinstance(machine, FixedBase | FreeFloating | Standing):
@@ -217,7 +217,7 @@ def _checked_machine(machine: Any) -> FixedBase | FreeFloating | Standing:
 
 
 def _checked_bases(findings: Findings, machine: FreeFloating, motion: Motion, base: Array | None) -> Array:
-    """Return the configurations of a floating base: as given, if they conserve the momentum, or integrated."""
+    """Return the configurations of a floating base: integrated or, if given, checked against the conserved momentum."""
     if base is None:
         bases, rows = integrate_base(machine, motion)
         findings.rows += rows
@@ -390,7 +390,7 @@ class PlanVerdict:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the plan, as a sentence whose subject the caller adds: "must not be run: ..."."""
+        """Verdict on the plan as the predicate of a sentence, such as "must not be run: ..."."""
         if not self.audit.feasible or self.check.passed:
             return self.audit.sentence
         first, count = self.check.faults[0], len(self.check.faults)
@@ -431,8 +431,8 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check times (M,), sampled joint positions, rates and accelerations (M, n) against a robot's limits; the last two
-    may be None.
+    """Check times (M,) and joint positions, rates and accelerations (M, n), the last two possibly None, against a
+    robot's limits.
     """
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem

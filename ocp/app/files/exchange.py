@@ -31,7 +31,7 @@ from ocp.storage import write_text, write_whole
 
 
 def _with_parts(fields: str, **parts: str) -> str:
-    """Return the ROS 2 definition of a message type: its header, its fields, and the types that the fields use."""
+    """Return the text that defines a ROS 2 message type: header, fields, and the types that the fields use."""
     parts["std_msgs/Header"] = "builtin_interfaces/Time stamp\nstring frame_id\n"
     parts |= {f"builtin_interfaces/{name}": "int32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")}
     bar = "=" * 80
@@ -409,7 +409,7 @@ def _path_and_kind(file: FileName) -> tuple[Path, str]:
 
 
 def _axes(language: RobotLanguage, names: Sequence[str], linear: Sequence[bool]) -> list[str]:
-    """Return the axis of a robot controller for each joint; raise ProblemError if axes or joints are missing."""
+    """Return the controller's axis for each joint; raise ProblemError if the joints and the axes do not match."""
     arm, external, axes = iter(language.arm), iter(language.external), list[str]()
     for name, is_linear in zip(names, linear, strict=True):
         axis = next(external if is_linear else chain(arm, external), None)
@@ -425,7 +425,7 @@ def _axes(language: RobotLanguage, names: Sequence[str], linear: Sequence[bool])
 
 
 def _percents(velocities: Array, names: Sequence[str], limits: Array) -> list[int]:
-    """Return the velocity of the fastest joint in each step (M - 1, n), in whole percent of its limit, 1 to 100."""
+    """Return the joint velocity closest to its limit in each step, in percent of the limit, from rates (M - 1, n)."""
     for name, limit in zip(names, limits.tolist(), strict=True):
         if not 0 < limit < np.inf:
             words = f"KRL states velocities in percent of their limits; the joint {name!r} has none; set it in the URDF"
@@ -435,7 +435,7 @@ def _percents(velocities: Array, names: Sequence[str], limits: Array) -> list[in
 
 
 def _urscript(name: str, remarks: list[str], points: list[dict[str, str]], seconds: list[str]) -> Iterator[str]:
-    """Yield the lines of a URScript program; see Universal Robots, *Script Manual*, `movej` and `servoj`."""
+    """Yield the lines of a URScript program (Universal Robots, *Script Manual*, `movej` and `servoj`)."""
     start, *others = (f"[{', '.join(point.values())}]" for point in points)
     yield from (f"def {name}():", *remarks, f"  movej({start}, a=0.5, v=0.25)")
     for point, duration in zip(others, seconds, strict=True):
@@ -444,7 +444,7 @@ def _urscript(name: str, remarks: list[str], points: list[dict[str, str]], secon
 
 
 def _krl(title: str, remarks: list[str], points: list[dict[str, str]], percents: list[int]) -> Iterator[str]:
-    """Yield the lines of a KRL program; see KUKA, *Operating and Programming Instructions for System Integrators*."""
+    """Yield the lines of a KRL program (KUKA, *Operating and Programming Instructions for System Integrators*)."""
     name = title if title[:1].isalpha() and title.upper() not in KRL_WORDS else f"p{title}"
     yield from ("&ACCESS RVP", f"DEF {name[:24]}()", *remarks, "  $APO.CPTP=50")
     previous, last = 0, len(points) - 1
@@ -458,7 +458,7 @@ def _krl(title: str, remarks: list[str], points: list[dict[str, str]], percents:
 
 
 def _rapid(name: str, remarks: list[str], points: list[dict[str, str]], seconds: list[str]) -> Iterator[str]:
-    """Yield the lines of a RAPID module; see ABB, *RAPID Instructions, Functions and Data types*, `MoveAbsJ`."""
+    """Yield the lines of a RAPID module (ABB, *RAPID Instructions, Functions and Data types*, `MoveAbsJ`)."""
     language, last = ROBOT_LANGUAGES["rapid"], len(points) - 1
     yield from (f"MODULE {name}", *remarks, "  PROC main()")
     for number, point in enumerate(points):

@@ -168,7 +168,7 @@ class _Reader:
             lines.append(self.block.number)
 
     def _run(self) -> bool:
-        """Execute the current line of G-code and return whether it ends the program."""
+        """Execute the current line of the G-code program; return whether the line ends the program."""
         words = dict(self.block.words)
         codes = {code for letter, code in self.block.codes if letter == "G"}
         self._check_groups(codes)
@@ -252,7 +252,7 @@ class _Reader:
         self._note(f"{code_name(code)}: its zero is the zero of the program")
 
     def _dwell(self, words: dict[str, float]) -> None:
-        """Add the pause of a G4, which lasts P seconds."""
+        """Add a pause of P seconds, which the code G4 requests."""
         if "P" not in words:
             self._refuse("G4 needs P, the time in s")
         duration = words.pop("P")
@@ -290,7 +290,7 @@ class _Reader:
         self._rapid(target)
 
     def _shift(self, codes: set[int], words: dict[str, float]) -> None:
-        """Shift the origin so that the current position gets the given coordinates (G92), or remove the shift."""
+        """Shift the origin so that the current position gets given coordinates (G92), or remove such a shift."""
         if 920 not in codes:
             self.offset = np.zeros(3)
             return
@@ -397,7 +397,7 @@ class _Reader:
             self._end_path()
 
     def _stop(self, words: dict[str, float]) -> bool:
-        """Execute the M words of a block and reject unused words; return whether the program ends."""
+        """Execute the M codes of a block; reject words that no code uses; return whether the program ends."""
         is_end = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
             kind, name = M_WORDS.get(code, ""), f"M{code // 10}"

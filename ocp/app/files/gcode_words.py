@@ -30,7 +30,7 @@ RADIUS_SHARE = 1e-3
 
 
 class ArcError(Exception):
-    """Error raised if the numbers of a G-code line describe no arc; states the reason, the gap and its limit, m."""
+    """Error raised if numbers of a G-code line describe no arc: the reason, the geometric error and its limit, m."""
 
     def __init__(self, why: str, size: float, limit: float) -> None:
         super().__init__(why)
@@ -235,7 +235,7 @@ def _without_comments(text: str) -> str:
 
 
 def _block(number: int, text: str, words: Sequence[str]) -> Block | None:
-    """Return the words of a line, in upper case and without comments, as a block; None without codes and values."""
+    """Return the words of a line, in upper case and without comments, as a block; None if the line has no words."""
     if exponent := EXPONENT.search(" ".join(words)):
         raise _InvalidBlock(f"{exponent[0]!r} is not a G-code number; write it without E")
     line = CHECKSUM.sub("", DELETED.sub("", "".join(words)))
@@ -267,7 +267,7 @@ def _tenths(letter: str, value: str) -> int:
 
 
 def _reason(line: str) -> str:
-    """Return why a line of G-code contains something other than letters with numbers."""
+    """Return an error text about the part of a G-code line that does not consist of letters with numbers."""
     if CONTROL.match(line):
         return NOT_RUN
     if any(sign in line for sign in "#[]=<>"):

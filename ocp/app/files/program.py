@@ -58,7 +58,7 @@ class Cut:
         return f"cut, lines {self.lines[0]} to {self.lines[-1]}"
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
-        """Return the path of the cut with rounded corners; the arguments are those of `Program.smooth`."""
+        """Return the path of the cut with its corners rounded, by the arguments of `Program.smooth`."""
         return self._fitted(tolerance, options)[0]
 
     def _fitted(self, tolerance: float | None, options: dict[str, Any]) -> tuple[SmoothPath, Array]:
@@ -161,7 +161,7 @@ class Program:
         return "\n".join([head, *(str(note) for note in self.notes)])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = NO_ROTATION) -> Program:
-        """Return the program with its origin at a pose in world; see `models.Path.placed`.
+        """Return the program with its origin moved to a pose in world: position, m, and unit quaternion.
 
         Raises:
             ModelError: The position is invalid, or the orientation is not a unit quaternion.
@@ -240,7 +240,7 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
 def smooth_path(
     path: Path, deviation: ArrayInput, options: dict[str, Any], corners: ArrayInput | None = None
 ) -> tuple[SmoothPath, NDArray[np.intp]]:
-    """Fit splines to short segments of a path and round its corners within a deviation, see `models.paths.fit_splines`.
+    """Replace runs of short segments of a path by splines, and round the corners, within a given deviation, m.
 
     Return also the index of the first segment that each segment of the result replaces; raise the errors of
     `models.smooth` as ProblemError.
@@ -255,7 +255,7 @@ def smooth_path(
 
 
 class ProgramMotion(NamedTuple):
-    """Motion of a program at M sample times.
+    """Motion of the tool in a machine-tool program at M sample times.
 
     Attributes:
         t: Sample times. Shape (M,), s.

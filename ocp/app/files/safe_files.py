@@ -90,7 +90,7 @@ class TableRow(NamedTuple):
 
     @property
     def has_names(self) -> bool:
-        """Whether a cell is neither empty nor a number, so that the row may name the columns."""
+        """Whether a cell of the row is neither empty nor a number, so that the row may name the columns."""
         return any(cell and not is_number(cell) for cell in self.cells)
 
 
@@ -123,7 +123,7 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def table_numbers(file: FileName, rows: Sequence[TableRow], used: Sequence[bool]) -> Array:
-    """Return the numbers in the used columns of a table, and zeros in the others; nan stands for an empty cell.
+    """Return the numbers in the columns of a table that are used, nan for empty cells, and 0 in all other columns.
 
     Raises:
         ProblemError: A row has too many or too few cells, or a cell is not a number; names the line.
@@ -205,7 +205,7 @@ class _Container:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append a list value, or the key or value of a mapping entry; `count` is the number of values in it."""
+        """Append an item to the list, or a key or value to the mapping; `count` includes the values nested in it."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):
@@ -318,7 +318,7 @@ SIGNATURES = {
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
-    """Check whether an output may be written to a file; return the path of the file with links resolved.
+    """Check whether an output file may be written; return its path after resolving symbolic links.
 
     `kind` is a key of SUFFIXES. The output must be in or below `folder`, unless that is None. Only if `force` is set, a
     file may be overwritten that selfmotion did not write.

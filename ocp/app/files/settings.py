@@ -153,7 +153,7 @@ class TomlTable:
         return value if value is None or value is default else np.array(value, dtype=float)
 
     def numbers_by_name(self, name: str, expected: str, *, least: float = -np.inf) -> dict[str, float]:
-        """Return the entry `name` as a dictionary of numbers above `least` by name; empty if the entry is missing."""
+        """Return the entry `name`, a table of numbers above `least`, as a dictionary; empty if it is missing."""
         table = self.table(name, expected)
         if table is None:
             return {}
@@ -163,12 +163,12 @@ class TomlTable:
         return {key: float(value) for key, value in table._values.items()}
 
     def values(self, readers: Readers) -> dict[str, Any]:
-        """Return those entries named in `readers` that the table has, by name, each read by its function."""
+        """Return the entries of the table that `readers` names, keyed by name, each read by its function."""
         values = {name: read(self, name, *arguments) for name, (read, *arguments) in readers.items()}
         return {name: value for name, value in values.items() if value is not None}
 
     def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
-        """Call `kind` with the entries of the table and other arguments; errors that `kind` raises name the line."""
+        """Return what the class or function `kind` builds from table entries and arguments; errors state the line."""
         values = self.values(readers) | arguments
         self.done()
         with located_errors(self):
@@ -214,7 +214,7 @@ class TomlTable:
         return {key: outer.required_table(key) for key in outer._values}
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
-        """Return a nested table with its place in the file, so that its errors name the line."""
+        """Return a table that is nested in this one, with its place in the file for error messages."""
         table = TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
         table.joints = self.joints
         return table
@@ -229,12 +229,12 @@ class TomlTable:
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Raise ProblemError if the table has entries with other names than the given ones."""
+        """Raise ProblemError if the table has entries other than those with the given names."""
         self._read_names.extend(names)
         self.done()
 
     def done(self) -> None:
-        """Raise ProblemError if the table has an entry that was not read; it names the line and the known entries."""
+        """Raise ProblemError if the table has an unread entry; the error names its line and all known entries."""
         for name in self._values:
             if name not in self._read_names:
                 similar, known = checks.similar_names(name, self._read_names), dict.fromkeys(self._read_names)
@@ -308,7 +308,7 @@ def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None
 def joint_values(
     entries: TomlTable, name: str, default: float, allowed: tuple[str, float | None] = (BY_JOINT, None)
 ) -> Any:
-    """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
+    """Return an entry that gives one number for each joint name as an array (n,); None if the entry is missing.
 
     Joints without a number get `default`. `allowed` are the expected values in words, and the number that all are
     above. If there is such a number, the entry may also be one number for all joints, which is returned as it is.

@@ -84,7 +84,7 @@ def _zmp_rule(entries: TomlTable, name: str) -> Any:
 
 
 def _uncertainties(entries: TomlTable, name: str) -> Any:
-    """Read the sizes of the uncertainties that a plan covers, by name."""
+    """Read the sizes of the uncertainties, by name, that the plan must tolerate."""
     sizes = entries.numbers_by_name(name, 'a table of sizes: { payload = 0.5, "tool offset" = 1e-3 }')
     return _located(entries, name, checked_uncertainty, sizes) or None
 
@@ -189,7 +189,7 @@ SPRING: Readers = dict.fromkeys(("stiffness", "rest"), (TomlTable.vector, 3, "th
 
 
 def _located(entries: TomlTable, name: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function and return its result; its errors name the line of an entry."""
+    """Call a function and return its result; add the line of an entry of the file to errors that it raises."""
     with located_errors(entries, name):
         return function(*arguments)
 
@@ -288,7 +288,7 @@ def _machine(entries: TomlTable, folder: Path, base: str = "fixed") -> Machine:
 
 
 def _loaded(entries: TomlTable, robot: Robot) -> Robot:
-    """Return the robot with the load, kg, that a table gives at the tip."""
+    """Return the robot with the payload of mass `load` (kg) that a table attaches to the tip, if it states one."""
     load, place = entries.positive("load", "kg"), (robot.tip_link, robot.tip_translation)
     return robot if load is None else _located(entries, "load", models.with_load, robot, place[0], load, place[1])
 
@@ -338,7 +338,7 @@ def _task(entries: TomlTable, folder: Path, machine: Machine) -> TipTask:
 
 
 def _pace(entries: TomlTable, path: SmoothPath, speed: float) -> tuple[Any, dict[str, Any]]:
-    """Read how the speed along the path changes; return the speed or a schedule, and arguments of `TipTask.along`."""
+    """Read how the speed along a path changes: return a speed or a schedule, and arguments of `TipTask.along`."""
     limits = entries.values(PACE)
     if entries.flag("steady"):
         for name in limits:

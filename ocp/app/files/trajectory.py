@@ -172,7 +172,7 @@ def _read_table(
 def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
-    """Identify the time column and the columns of each joint; return them with their factors to SI units, and notes."""
+    """Identify the columns of time and joints in a table; return them with factors to SI units, and notes."""
     if joint_names := table_joints(head):  # our own table: the names of its joints are not interpreted
         columns = [(name, kind) for kind in KINDS[:3] for name in joint_names]
         return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
@@ -209,7 +209,7 @@ def _meanings(
 
 
 def _kind(name: str) -> tuple[str, str]:
-    """Return the joint and the kind of value, such as "velocities", that the name of a column denotes."""
+    """Return the joint, and the kind of value such as "velocities", that the name of a table column denotes."""
     for sign in "./:_ ":
         prefix, _, last = name.rpartition(sign)
         if prefix and last.lower() in WORDS:

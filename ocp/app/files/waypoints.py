@@ -247,7 +247,7 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
 
 
 def _head(file: FileName, first: TableRow, columns: Sequence[str] | None) -> tuple[list[str], int]:
-    """Return the column names that the header or the caller gives, and the index of the first data row."""
+    """Return the names of the columns, from the header or the caller, and the index of the first row of data."""
     cells = first.cells
     if columns is not None:
         names = [] if isinstance(columns, str) else list(require.each("columns", columns, str))

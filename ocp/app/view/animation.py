@@ -69,7 +69,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Corners (k, 2) of the contact area, and zero moment points (M, 2), m; `forces` if these count external forces."""
+    """Corners (k, 2) of the contact area, zero moment points (M, 2), m, and whether these include external forces."""
 
     corners: Array
     points: Array
@@ -212,7 +212,7 @@ PAGE_SETTINGS = PageSettings()
 
 
 class ClosestPairs(NamedTuple):
-    """The pair of bodies with the smallest clearance margin at each of K times.
+    """Pair of bodies with the smallest difference between distance and required clearance, at each of K times.
 
     Attributes:
         t: Times, s. Shape (K,).
@@ -439,9 +439,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
 
 
 def _margins(rows: Sequence[Curve]) -> list[Curve]:
-    """Return curves of the least margin of each inequality constraint and the largest error of each equality
-    constraint.
-    """
+    """Return, as curves, the least margin of each inequality constraint and the largest error of each equality."""
     curves = []
     for name in dict.fromkeys(one.group for one in rows):
         group = [one for one in rows if one.group == name]
@@ -456,7 +454,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 
 
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
-    """Return the closest pair of bodies at uniform times of a motion, or None if the pairs are unknown.
+    """Return the closest pair of bodies at evenly spaced times of a motion, or None if the pairs are unknown.
 
     `parts` are solutions, suffixes and times as returned by `Plan.solved_parts` for these times.
     """

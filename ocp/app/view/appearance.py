@@ -79,9 +79,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """Surfaces with which a robot is displayed, and the meshes that are not shown, as named in the description, with
-    reasons.
-    """
+    """Surfaces with which a robot is displayed, and the reasons why meshes, keyed by file name, are not shown."""
 
     parts: tuple[Part, ...]
     missing: dict[str, str]
@@ -213,7 +211,7 @@ def _merge_corners(mesh: Triangles, size: float) -> Triangles:
 
 
 def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
-    """Group surfaces by link and colour, and return one Part (a surface of one colour) for each group."""
+    """Group surfaces by link and colour, and return one `Part` for each group."""
     parts = []
     for link in dict.fromkeys(name for name, _ in surfaces):
         mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
@@ -276,8 +274,8 @@ TIP_FRAME = "the tip frame"
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of the links and of the tip in the world along a motion, by link name or TIP_FRAME: axes as columns (M, 3,
-    3), and origins (M, 3), m.
+    """World poses of the links and of the tip along a motion, by link name or TIP_FRAME: rotation matrices (M, 3, 3)
+    and origins (M, 3), m.
     """
 
     rotations: dict[str, Array]

@@ -172,7 +172,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
 
 
 def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
-    """Return a motion as JSON data of the web page; its arrays go to `buffers`, the binary data."""
+    """Return a motion as JSON data of the web page; arrays are appended to the binary data `buffers`."""
     rows = np.unique(np.linspace(0, len(motion.t) - 1, min(len(motion.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
@@ -241,7 +241,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
 
 
 def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return an obstacle's surface as JSON data of the web page; its arrays go to `buffers`, the binary data."""
+    """Return an obstacle's surface as JSON data of the web page; arrays are appended to the binary data `buffers`."""
     part = part_of("", vertices, faces, (0.0, 0.0, 0.0, 1.0))
     return _surface(part.vertices, part.normals, part.faces, buffers)
 

@@ -239,7 +239,7 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(name: str, motion: Any) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution or of a result of `resolve`, by name."""
+    """Return the number of entries of each state and control of a solution or a local motion, keyed by name."""
     if isinstance(motion, LocalSolution):
         return {entry: values.shape[1] for entry, values in _local(motion).items()}
     if not isinstance(motion, Solution):
@@ -249,13 +249,13 @@ def _widths(name: str, motion: Any) -> dict[str, int]:
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
-    """Return base, joints and rates of a result of `resolve`, named as the states and controls of a solution."""
+    """Return base, joints and rates of a local (resolved-rate) motion, named as in a solution."""
     samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
     return {name: values for name, values in samples.items() if values.shape[1]}
 
 
 def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times, s, and values of each state and control by name; jumps at nodes have the values of both sides."""
+    """Return times, s, and values of each state and control by name, with both one-sided values at jumps."""
     if isinstance(motion, LocalSolution):
         return {name: (motion.t, values) for name, values in _local(motion).items()}
     nodes = motion.control_interpolant.breaks[1:-1]

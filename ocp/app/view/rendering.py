@@ -147,8 +147,8 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Horizontal ground at a height, m, with lines of a square grid, which fades within a radius, m, around its middle
-    (x, y), m.
+    """Horizontal ground with the lines of a square grid: height, m, middle (x, y), m, radius at which the ground fades
+    out, m, and grid spacing, m.
     """
 
     height: float
@@ -332,7 +332,7 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _blocks(cells: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the given numbers of picture samples in blocks of at most `batch_size`."""
+    """Split the indices of picture samples into blocks of at most `batch_size` indices."""
     return np.array_split(cells, len(cells) // PICTURE_STYLE.batch_size + 1)
 
 

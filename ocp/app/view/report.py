@@ -218,7 +218,7 @@ class LimitView(NamedTuple):
 
 
 def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_range: float) -> LimitView:
-    """Return how a diagram shows the limits of curves with values from `low` to `high`.
+    """Return which limits of a diagram are drawn as lines or given as text, for curves between `low` and `high`.
 
     Limits near the curves are drawn as lines, limits far away are given as text, to keep the shape of the curves
     visible. Curves with a range smaller than `min_range` are drawn as constant.
@@ -249,7 +249,7 @@ def curve_samples(motion: Motion, kind: str) -> tuple[Array, Array | None]:
 
 
 def bounds_of(bounds: JointBounds, kind: str) -> tuple[Array, Array]:
-    """Return the lower and upper limits of the joints for a quantity in KINDS. Shape (n,) each."""
+    """Return the lower and upper joint limits of one kind of quantity, such as "velocity". Shape (n,) each."""
     limit = getattr(bounds, kind, None)
     return (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
 

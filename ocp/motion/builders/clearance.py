@@ -217,7 +217,7 @@ def solve_with_clearance(
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a constraint name, with or without the name of a phase in front, denotes a clearance."""
+    """Return whether a name, with or without the name of a phase in front, is that of a clearance constraint."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
@@ -232,7 +232,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate a function that accepts only SX expressions of base, joints and time, also for MX expressions."""
+    """Evaluate a function of base, joints and time that accepts only SX expressions, for MX expressions as well."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

@@ -95,7 +95,7 @@ def least_durations(distances: Array, bounds: JointBounds) -> Array:
 
 
 def least_squared_velocities(distances: Array, duration: float, acceleration: Array) -> Array:
-    """Return the least integral of each joint's squared velocity, from rest to rest over distances d. Shape (..., n).
+    """Return each joint's least integral of squared velocity from rest to rest over given distances. Shape (..., n).
 
     Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity v = 2 d /
     (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a). It is infinite where the
@@ -140,7 +140,7 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion as a solution of a `dynamics_problem` without the control "power", and without multipliers.
+        """Return the motion as a solution of a `dynamics_problem`; the multipliers and the control "power" are missing.
 
         `method` is a phrase for what the motion does, such as "stops at the corners of a path".
         """
@@ -168,7 +168,7 @@ class ConstantJerkMotion:
 def path_solution(
     problem: Problem, method: str, curves: tuple[PiecewisePolynomial, ...], *, horizon: float, cost: float, message: str
 ) -> Solution:
-    """Return a motion that no solver computed, given by curves of states, control and costates, as a solution.
+    """Return curves of states, controls and costates, which no solver computed, as a solution of a problem.
 
     `message` says why its optimality is open; it is empty if the motion is optimal.
     """
@@ -225,7 +225,7 @@ class TorqueLimits:
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the limited torques, then powers (M, R), and their Jacobians in position, rate and acceleration."""
+        """Return the limited torques and then powers (M, R), and their Jacobians in position, rate and acceleration."""
         values, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
         return values, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
@@ -303,7 +303,7 @@ def segment_durations(changes: Array, bounds: JointBounds) -> Array:
 
 
 def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk limits of joints; those that a velocity profile needs are finite."""
+    """Return velocity, acceleration and jerk limits of joints; missing limits become finite where profiles need it."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -313,7 +313,7 @@ def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array,
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest profiles (K,), from 0 to 1, of the covered fraction of straight displacements (K, n)."""
+    """Return the fastest profiles of K straight motions over joint displacements (K, n), as fractions of these."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -228,7 +228,7 @@ def roll_problem(
     target = _target_at(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Return an expression of target and roll as a function of the problem's time and roll."""
+        """Replace the symbols of target and roll in an expression by the problem's target over time and its roll."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -278,7 +278,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig at equally spaced times t, (samples,), rad, of least integrated cost and squared rate.
+    """Return the rig's roll, rad, at equally spaced times (samples,) with the least integral of cost and squared rate.
 
     Dynamic programming minimises the integral of `cost`, a function of (indices of times, rolls), both (n,), and of the
     weighted squared rate. A grid of rolls does not resolve accelerations. Their weight is replaced by a weight of the

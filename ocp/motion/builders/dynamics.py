@@ -417,7 +417,7 @@ def _declare_motion(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return positions or velocities given for one end as numbers (n,), nan where free, or raise ProblemError."""
+    """Check positions or velocities given for one end of a motion; return them as numbers (n,), nan where free."""
     if value is None:
         return np.full(n, np.nan)
     with suppress(*NOT_NUMBERS):
@@ -428,7 +428,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scales (4, n) of angles, speeds, accelerations and jerks of reaction wheels, nan for other joints."""
+    """Return scale factors (4, n) of angles, speeds, accelerations, jerks of reaction wheels, nan for other joints."""
     # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():

@@ -290,8 +290,8 @@ def within_limits(
 
 
 def _first_within_limits(problem: Problem, mesh: Collocation, settings: SolveSettings, begin: Guess) -> Solution:
-    """Return the first plan on finer and finer meshes that passes its audit within its limits, or else the feasible one
-    of least cost; raise SolveError if there is none, or if a plan fails only because of collisions.
+    """Return the first plan on finer and finer meshes that passes its audit, or else the feasible one of least cost;
+    raise SolveError if there is none, or if a plan fails only because of collisions.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin
@@ -341,7 +341,7 @@ def _first_within_limits(problem: Problem, mesh: Collocation, settings: SolveSet
 def _attempts(
     problem: Problem, mesh: Collocation, settings: SolveSettings, guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Solve a problem on a mesh, then with nodes at the plan's switches; yield label and plan, or error, of each."""
+    """Solve a problem on a mesh, then with nodes at switching times; yield a label and the plan or error of each."""
     try:
         plan = solve(problem, mesh, options=settings.options_from(problem, mesh, guess), guess=guess)
     except SolveError as error:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from models import FixedBase, Machine
 from models.checks import NOT_NUMBERS, Array, floats
@@ -108,7 +109,7 @@ class PlannedJoints:
         return _Along(*(self.curves(places, order) for order in range(4)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return inertia, drag and rest terms of the joint torques at path distances (M,), m. Shape (M, n) each.
+        """Return coefficients of the joint torques (inertia, drag, rest) at path distances (M,), m. Shape (M, n) each.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -162,32 +163,64 @@ def joint_path(
     if len(own) != machine.joint_size:
         message = f"{len(own)} names for {machine.joint_size} joints"
         raise ProblemError(message, name="names", value=own, limit=machine.joint_size)
-    curves = scipy.interpolate.make_interp_spline(s, joints, k=DEGREE, t=_knots(s, path))
-    half = np.arange(0, len(s), 2)
-    half = half if half[-1] == len(s) - 1 else np.append(half, len(s) - 1)
-    coarse = scipy.interpolate.make_interp_spline(s[half], joints[half], k=DEGREE, t=_knots(s[half], path))
-    error = float(np.abs(coarse(s) - joints).max())
+    half = np.union1d(np.arange(0, len(s), 2), len(s) - 1)
+    error = float(np.abs(_interpolate(s[half], joints[half], path)(s) - joints).max())
+    used = _informative_samples(s, joints, path)
+    curves = _interpolate(s[used], joints[used], path)
     torques = _torque_function(machine) if isinstance(machine, FixedBase) else None
     return PlannedJoints(machine, own, float(length), error, curves, torques)
 
 
-def _knots(s: Array, path: Any) -> Array:
-    """Return the knots of an interpolating spline that is as smooth as the path where its segments meet.
+def _interpolate(s: Array, joints: Array, path: Any) -> Any:
+    """Return the spline through joint positions (M, n) at distances (M,) that is as smooth as the path."""
+    return scipy.interpolate.make_interp_spline(s, joints, k=DEGREE, t=_knots(s, path))
 
-    The knots are at the samples (M,), except the samples next to a bound between two segments. Their knots are moved to
-    the bound: three for continuous second derivatives, four where the curvature jumps. A bound with fewer samples
-    nearby than that, because other bounds are nearer to them, has fewer knots.
+
+def _informative_samples(s: Array, joints: Array, path: Any) -> NDArray[np.intp]:
+    """Return the indices of the samples to interpolate; further samples would only add noise to the derivatives.
+
+    Every second sample of a segment is left out while the spline through the others predicts it to 2^3 times its
+    rounding error: of the third derivative, the error of interpolation is then below that of rounding, which falls with
+    the cube of the distance between samples.
+    """
+    slopes, bounds = np.abs(np.diff(joints, axis=0)) / np.diff(s)[:, None], getattr(path, "bounds", s[[0, -1]])
+    tolerance = 2**3 * np.finfo(float).eps * (np.abs(joints).max() + s[-1] * slopes.max())
+    used, segment = np.arange(len(s)), np.searchsorted(bounds[1:-1], s, side="right")
+    while True:
+        own = segment[used]
+        counts = np.bincount(own, minlength=len(bounds) - 1)
+        halved = counts >= 2 * (DEGREE + 1)
+        odd = (np.arange(len(used)) - (np.cumsum(counts) - counts)[own]) % 2 == 1
+        rest = ~(odd & halved[own]) | (used == used[-1])
+        deviations = np.abs(_interpolate(s[used[rest]], joints[used[rest]], path)(s) - joints).max(axis=1)
+        halved[segment[deviations > tolerance]] = False
+        if not halved.any():
+            return used
+        used = used[rest | ~halved[own]]
+
+
+def _knots(s: Array, path: Any) -> Array:
+    """Return the knots of an interpolating spline that is as smooth as the path where path segments meet.
+
+    The knots are at the samples (M,), except near a bound between two segments. There, knots are moved to the bound:
+    three for continuous second derivatives, four where the curvature jumps. The next knots are moved halfway towards
+    the bound's, so that two cells of 1.5 times the distance between samples begin there, not one of twice the distance,
+    whose error would be larger. A bound with fewer samples nearby, because other bounds are nearer to them, has fewer
+    knots.
     """
     inner = s[DEGREE // 2 + 1 : -(DEGREE // 2) - 1].copy()
     bounds = np.asarray(getattr(path, "bounds", s[[0, -1]]), dtype=float)[1:-1]
     if bounds.size:
         jumps = path.curvature_jumps()
-        sharp, every = jumps > ROUNDING_SHARE * (1 + jumps.max()), np.ones(len(bounds), dtype=bool)
+        sharp = jumps > ROUNDING_SHARE * (1 + jumps.max())
         after, owner = np.searchsorted(inner, bounds), np.searchsorted((bounds[:-1] + bounds[1:]) / 2, inner)
-        for shift, moved in ((-2, sharp), (-1, every), (0, every), (1, every)):
+        middles = (inner + np.append(inner[1:], inner[-1:])) / 2
+        left = np.where(sharp, bounds, middles[np.maximum(after - 2, 0)])
+        right = middles[np.minimum(after + 1, len(inner) - 1)]
+        for shift, places in ((-2, left), (-1, bounds), (0, bounds), (1, bounds), (2, right)):
             at = np.clip(after + shift, 0, len(inner) - 1)
-            own = moved & (owner[at] == np.arange(len(bounds))) & (at == after + shift)
-            inner[at[own]] = bounds[own]
+            own = (owner[at] == np.arange(len(bounds))) & (at == after + shift)
+            inner[at[own]] = places[own]
     ends = np.ones(DEGREE + 1)
     return np.concatenate([s[0] * ends, inner, s[-1] * ends])
 
@@ -211,7 +244,7 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _sample_places(path: Any, length: float, samples: int) -> Array:
-    """Return at least `samples` distances that are evenly spaced in each segment of a path and resolve all of them."""
+    """Return at least `samples` distances along a path: evenly spaced in each segment, and several in every segment."""
     bounds = np.asarray(getattr(path, "bounds", (0.0, length)), dtype=float)
     shares = (samples - 1) * np.diff(bounds) / length
     counts = np.maximum(np.ceil(shares * (1 - ROUNDING_SHARE)), SPLINE.segment_samples).astype(np.intp)
@@ -220,8 +253,8 @@ def _sample_places(path: Any, length: float, samples: int) -> Array:
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
-    """Return the distances, m, along a path of the targets of a plan at given times; raise ProblemError unless the
-    targets run along the whole path. Shape (M,).
+    """Project the targets of a plan at given times onto a path, and return their distances along the path, m. Raise
+    ProblemError unless the targets run along the whole path. Shape (M,).
     """
 
     def fail(fault: str, at: int, value: float) -> ProblemError:
@@ -342,7 +375,7 @@ class _BatchedFunction:
         try:
             table, steps = self.tables.setdefault(width, []).pop()
         except IndexError:  # first call, or in use by another thread
-            table, steps = self._table(width)
+            table, steps = self._allocate(width)
         np.concatenate([value.T for value in inputs], out=table[self.inputs, :count])
         for operation, places in steps:
             operation(*places)
@@ -351,8 +384,8 @@ class _BatchedFunction:
             result[:] = part.T
         self.tables[width].append((table, steps))
 
-    def _table(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return a work array with one line per intermediate value, and the function's instructions on its lines."""
+    def _allocate(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
+        """Allocate a work array, a row for each value in the Function; return it and the instructions on its rows."""
         table = np.zeros((self.rows + len(self.constants), width))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)

@@ -231,7 +231,9 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over theta in scaled units; `along` gives `path_columns` and their speed."""
+    """Declare the minimum-time problem, with the time of the reference motion as independent variable, in scaled units.
+    `along` returns the reference speed and the `path_columns` at such a time.
+    """
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -272,8 +274,8 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits at
-    path speed v, acceleration a and jerk j; `values` are the reference speed and the values of `path_columns`.
+    """Return the ratios of centripetal acceleration and of joint velocities, accelerations and jerks to their limits,
+    at path speed v, acceleration a and jerk j. `values` has the reference speed, then the columns of `path_columns`.
     """
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
@@ -309,7 +311,7 @@ def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances, m, that the reference motion covers before and after a given time interval."""
+    """Return the distances, m, that the reference motion covers before the start and after the end of a time span."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)
@@ -360,7 +362,7 @@ def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature and three derivatives of the joints at distances (M,). Shape (M, C).
+    """Return speed limit, curvature and first three joint derivatives at path distances (M,), as columns. Shape (M, C).
 
     The curvature is zero if the centripetal acceleration is not limited.
     """

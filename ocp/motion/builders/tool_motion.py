@@ -97,7 +97,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into intervals in each of which the active tasks do not change; limit pose feedback gains.
+    """Divide the horizon into intervals in which the active tasks do not change, and limit the gains of pose feedback.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -223,11 +223,11 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of a stretch's duration to the horizon, by which the dynamics in it are scaled."""
+        """Return the ratio of a stretch's duration to the horizon, which scales the dynamics in the stretch."""
         return stretch.duration / self.horizon
 
     def declare_states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare joint positions and, if the base moves, its configuration in one stretch; return base and joints."""
+        """Declare the states of one time interval: a floating base and the joint positions; return their symbols."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -241,7 +241,7 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def declare_velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare the joint velocities in one stretch; return velocities, accelerations and running cost."""
+        """Declare the joint velocities in one time interval; return velocities, accelerations and running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -359,7 +359,7 @@ def _declare_in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _declare_closure(motion: _Motion) -> Any:
-    """Declare a constant velocity error of a task on a closed path, so that the joints can return exactly.
+    """Declare a constant offset of the task velocity on a closed path, so that the joints can return exactly.
 
     If the joints return, the task returns as well. Both conditions differ by the error of the discretisation alone.
     """

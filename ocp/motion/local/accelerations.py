@@ -36,7 +36,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Secondary objective: a configuration index to improve by joint motions that disturb no task of higher priority.
+    """Secondary objective: an index of the configuration that joint motion in the null space of the tasks improves.
 
     Attributes:
         index: ``joint_limits``, p1 of equation (23) of Yoo et al. 2004, to be decreased; ``manipulability`` of the rows
@@ -137,12 +137,12 @@ class _TaskHierarchy:
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add joint accelerations after projecting them onto the null space of all tasks added before."""
+        """Add given joint accelerations after projecting them onto the null space of all tasks added before."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
 def _check_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a law is unknown or, with `size` rows of tasks, needs more joints than the machine has."""
+    """Raise ProblemError if a control law is unknown, or needs more joints for `size` task rows than there are."""
     require.choice("law", law, get_args(Law))
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
@@ -207,7 +207,7 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return matrix and right side of equations for the accelerations that keep a machine upright, see `Stabiliser`.
+    """Return matrix and right side of the equations for the joint accelerations that keep a machine upright.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.

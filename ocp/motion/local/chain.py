@@ -45,25 +45,25 @@ NEWTON = NewtonSettings()
 
 
 class Motion(NamedTuple):
-    """M rigid motions, given by rotation matrices `turn` (M, 3, 3) and translations `shift` (M, 3)."""
+    """Set of M rigid motions, given by rotation matrices `turn` (M, 3, 3) and translations `shift` (M, 3)."""
 
     turn: Array
     shift: Array
 
     def take(self, chosen: NDArray[np.intp]) -> Motion:
-        """Return the rigid motions with the given indices."""
+        """Return the subset of the rigid motions that has the given indices."""
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the rigid motions that result if the motions `first` are applied before these motions."""
+        """Return the rigid motions that result if the motions `first` are applied before the motions of this set."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
-        """Return M directions, shape (M, 3), each rotated by one of these rigid motions."""
+        """Return M directions, shape (M, 3), each rotated by the rigid motion with the same index."""
         return np.asarray((self.turn @ vectors[:, :, None])[:, :, 0])
 
     def at(self, points: Array) -> Array:
-        """Return M points, shape (M, 3), each moved by one of these rigid motions."""
+        """Return M points, shape (M, 3), each moved by the rigid motion with the same index."""
         return self.rotate(points) + self.shift
 
     @property
@@ -102,7 +102,7 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return coefficients (1, 3) of 1, cos q, sin q in `fixed` . (`vector` rotated about the axis by `sign` q)."""
+        """Return coefficients (1, 3) of 1, cos q, sin q in dot(`fixed`, `vector` turned about the axis by `sign` q)."""
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
@@ -277,7 +277,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return index pairs of IK solutions of the same pose, from the increasing pose index of each. Shapes (P,)."""
+    """Return the indices (P,) of both members of all pairs of IK solutions that belong to the same pose."""
     if not len(pose) or pose[0] == pose[-1]:
         return np.triu_indices(len(pose), 1)
     first = np.arange(len(pose))[:, None]

@@ -76,7 +76,7 @@ class PoseSolver(ABC):
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
-        """Return all isolated IK solutions at M poses, and flags of poses where some may be missing. Shape (M,).
+        """Return all isolated IK solutions at M poses, and a mask (M,) of poses where some solutions may be missing.
 
         Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
         continuously on the pose, and of a family some members are found.
@@ -95,7 +95,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Yield poses displaced from given poses to two opposite sides, at which missing solutions may be found."""
+        """Yield sets of poses displaced slightly from given poses, at which missing IK solutions may be found."""
         rng = np.random.default_rng(FORMS.seed)
         for _ in range(FORMS.pairs):
             turn, shift = FORMS.distance * rng.normal(size=(2, 3))
@@ -151,12 +151,12 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Stack the joint positions of IK solutions, listed in joint order `order`, in one column in chain order."""
+        """Stack the joint positions of IK solutions in one column; `order` has the joint indices of their entries."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function from a tip pose to two IK solutions of a SCARA and the excess of the pose over its reach."""
+        """Function from a tip pose to two IK solutions of a SCARA, and the excess of the pose over the arm's reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -167,7 +167,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function from a tip pose to candidate angles of joints x and z of `_loop`, residuals and conditioning."""
+        """Function from a tip pose to candidate angles of two joints, with residuals and condition of the equations."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -192,8 +192,8 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function from a tip pose and the two angles of `_pair_function` to two IK solutions of all joints, the excess
-        over the reach, and the lever arm of joint y, which is between x and z.
+        """Function from a tip pose and angles of the first and third joint in the loop closure equation to two IK
+        solutions, the fraction by which the reach of the last three joints is exceeded, and the second's lever arm.
         """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
@@ -210,7 +210,7 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose."""
+    """Loop closure equation of an arm in CasADi symbols: the product of the joint motions equals a goal pose."""
 
     symbols: Any  # positions of the redundant joints, rows of the rotation of the tip, its position, (k + 12,)
     axes: list[SymbolicAxis]
@@ -339,7 +339,7 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return mean and half the difference of the roots q, or nearest angles, of cosine cos(q) + sine sin(q) = value."""
+    """Return the mean and half the difference of the two roots q, or best q, of a cos(q) + b sin(q) = value."""
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 

@@ -108,7 +108,7 @@ def largest_changes(
     *,
     box: tuple[Array, Array, Array],
 ) -> Array:
-    """Return upper bounds of how much the distances of pairs change within boxes of joint displacements, m. Shape (K,).
+    """Return upper bounds (K,) on the change of body distances, m, within boxes of joint displacements.
 
     A displacement is d = T . t + e with |t_a| <= reach_a and |e_j| <= rest_j. A point p of a body then moves, relative
     to the other body, by no more than
@@ -150,7 +150,7 @@ def largest_changes(
 
 
 def _has_exact_depth(first: Hull, second: Hull) -> bool:
-    """Return whether the penetration depth of two bodies is exact: of segments and boxes, and of half-spaces."""
+    """Return whether the penetration depth of two bodies is computed exactly: for half-spaces, segments and boxes."""
     return bool(first.normal.size or second.normal.size) or max(first.kind, second.kind) <= 2
 
 
@@ -162,7 +162,7 @@ def _relative_pose(frames: Frames, at: NDArray[np.intp], frame: int, observer: i
 
 
 def _fixed_base_frames(scene: CollisionScene, joints: Array) -> Frames:
-    """Return the frames of the bodies, among fixed obstacles, in configurations (M, n) of a machine on a fixed base."""
+    """Return the frames of all bodies at configurations (M, n) of a machine on a fixed base; no obstacle moves."""
     count = len(joints)
     return frames_of(prepared_pairs(scene)[0](np.zeros((count, 0)), joints, np.zeros((count, 1)))[0])
 
@@ -193,7 +193,7 @@ def worst_collisions(
 def _collision_at(
     scene: CollisionScene, place: tuple[int, int], distance: float, base: Array, joints: Array, times: Array
 ) -> Collision:
-    """Return the collision of a pair of bodies at a sample of a motion; `place` has the indices of sample and pair."""
+    """Return the collision of a pair of bodies at a sample; `place` is the index of the sample, then of the pair."""
     at, pair = place
     base, time = np.broadcast_to(base, (len(joints), scene.machine.base_size))[at], float(np.ravel(times)[at])
     covers = pair in scene.cover_pairs
@@ -209,7 +209,7 @@ def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return a scene's cached functions: body frames from (base, joints, time), and pair distances from frames."""
+    """Return two cached functions of a scene: body frames from (base, joints, time), and distances from frames."""
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine

@@ -73,7 +73,7 @@ class Axis(NamedTuple):
     revolute: bool = True
 
     def take(self, chosen: NDArray[np.intp]) -> Axis:
-        """Return the axis at the poses with the given indices."""
+        """Return the joint axis at only those of the M poses that have the given indices."""
         return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
@@ -97,7 +97,7 @@ class LoopOpening(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """Loop closure equations of six joints at M poses: the product of the joint motions is the goal motion."""
+    """Loop closure equation of six joints at each of M poses: the product of the joint motions is the goal motion."""
 
     joints: list[Axis]
     goal: Motion
@@ -105,7 +105,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate IK solutions that result from opening the closed kinematic loop at one joint."""
+    """Candidate IK solutions, with counts per pose, that result from opening the kinematic loop at one joint."""
 
     pose: NDArray[np.intp]  # index of the pose of each candidate, (K,)
     free: Array  # positions of the free joints, (K, 6)
@@ -121,11 +121,11 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip, see `PoseSolver.solve_regular`.
+        """Return the IK solutions at M poses, and masks of poses where completeness is to be confirmed, or doubtful.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
-        number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
-        confirmed. Such poses are solved with further openings.
+        number of solutions were found. Multiple eigenvalues mix the products of several solutions; completeness is then
+        to be confirmed. Such poses are solved with further openings.
         """
         prescribed, count = self.prescribe(redundant), len(tips.shift)
         even, solutions = bool(self.chain.revolute[self.free].all()), Solutions.none(len(self.chain.axes))
@@ -206,15 +206,15 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Return a kinematic loop opened at a joint; the joints before it, transformed by the inverse goal, come last."""
+    """Return the loop opened at a joint: the joints before it come last, transformed by the inverse goal motion."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Return singular vectors (M, 15, 15) and ranks (M,) of the terms of a loop's first two joints, to be eliminated,
-    and coefficients (M or 1, 15, 3, 3, 3) of the terms of the other joints.
+    """Return singular vectors (M, 15, 15) and ranks (M,) of the coefficients of a loop's first two joints, which are
+    eliminated, and coefficients (M or 1, 15, 3, 3, 3) for the three joints that follow.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -228,8 +228,10 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coefficients (M, 15, 3, ...) of a moved line element's conformal coordinates in 1, cos h, sin h of
-    joint angles h. `axes` begins with the joint that moves it first; the trailing dimensions have the reverse order.
+    """Return the coefficients of 1, cos and sin of joint angles in 15 coordinates of a point and direction they move.
+
+    The module's docstring defines the coordinates. Shape (M, 15, 3, ...). `axes` begins with the joint that moves the
+    point first; the array has the axes of the joint angles in reverse order.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
@@ -261,7 +263,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the matrices (M, 3, 12, 12) that 1, cos h and sin h multiply in the eigenvalue problem of an angle h."""
+    """Return the coefficient matrices (M, 3, 12, 12) of 1, cos and sin of a joint angle in its eigenvalue problem."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -275,8 +277,8 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices (M, 24, 24) of polynomial eigenvalue problems whose eigenvalues are tan((h - pole) / 2)
-    of an angle h, the poles (M,), rad, and reciprocal condition numbers (M,) of the leading coefficients.
+    """Return companion matrices (M, 24, 24) with eigenvalues tan((h - pole) / 2) for the solutions h of eigenvalue
+    problems in cos h and sin h, the poles (M,), rad, and reciprocal condition numbers (M,) of leading matrices.
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))
@@ -307,7 +309,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate IK solutions of a kinematic loop opened at a joint, from real eigenvalues of its problem."""
+    """Return candidate IK solutions of a loop opened at a joint, from the real eigenvalues of a matrix problem."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -358,7 +360,7 @@ def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
 
 
 def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Complete positions (K, 3) of the third, fourth and fifth joint of a loop to positions (K, 6) of all its joints.
+    """Return the positions (K, 6) of all joints of a loop, given positions (K, 3) of the third to fifth joint.
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

@@ -120,14 +120,14 @@ def joint_range(machine: Machine, limits: bool) -> tuple[Array, Array]:
 
 
 def sampling_range(lower: Array, upper: Array, revolute: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return finite limits (n,) for sampling joints; an unlimited range becomes one turn or twice `ARM.slide_range`."""
+    """Return finite limits (n,) for sampling; unlimited joints get one turn or, if prismatic, 2 `ARM.slide_range`."""
     span = np.where(revolute, np.pi, ARM.slide_range)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     return low, np.where(np.isfinite(upper), upper, low + 2 * span)
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on."""
+    """Return `count` points of a low-discrepancy sequence in the unit cube of a given dimension, from index `first`."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
@@ -293,7 +293,7 @@ class ArmSolver:
         return joints, pose, tuple(reasons)
 
     def _of_the_arm(self, solver: PoseSolver, solutions: Solutions, goal: Motion) -> Solutions:
-        """Return a solver's solutions in the joints of the arm, one of each set that differs in added joints only."""
+        """Return a solver's solutions for the joints of the arm alone, without those that then become duplicates."""
         n, extended = len(self.chain.axes), solver.chain
         if self.auxiliary:
             still = (np.abs(solutions.joints[:, list(self.auxiliary)]) < ARM.auxiliary).all(axis=1)
@@ -329,7 +329,7 @@ class ArmSolver:
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples (S, 3, 3) of the free rotations of the tip, from shares of roll, azimuth and cone area."""
+        """Map samples of the unit cube to permitted rotations (S, 3, 3) of the tip: roll, azimuth, tilt in the cone."""
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return rolled
@@ -347,7 +347,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
-    """Return the solvers of an arm, if any, and its auxiliary joints; orientation is free about `axes` (k, 3)."""
+    """Return the pose solvers of an arm whose tip may rotate about `axes` (k, 3), and the added joints kept at zero."""
     extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
@@ -374,7 +374,7 @@ def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tu
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return the Jacobian's least singular value, a mean over samples, for each choice of redundant joints."""
+    """Return for each choice of redundant joints the least singular value of the Jacobian, averaged over samples."""
     _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
     columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
     values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
@@ -399,7 +399,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """Solver of all IK configurations of a pose task at samples of its free parameters, see `ik_branches`."""
+    """Solver of all IK configurations for given targets of a pose task, at samples of the parameters that are free."""
 
     def __init__(self, equations: TaskEquations, arm: ArmSolver) -> None:
         self.arm, self.complete = arm, arm.complete
@@ -408,7 +408,7 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return configurations at task targets (size,) for samples of free parameters, unlimited angles within pi.
+        """Return the configurations that satisfy task targets (size,), for samples of the free parameters.
 
         Args:
             count: Number of samples of the free parameters, over several choices of the sampled joints.

@@ -242,7 +242,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, if a solver exists, and the number of guesses to add."""
+        """Return IK solutions (K, n) on all branches if a solver exists, and how many random guesses shall be added."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -374,7 +374,7 @@ def spread_points(points: Array, count: int) -> NDArray[np.intp]:
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
-    """Return for each IK solution its closest pair of bodies if that violates the clearance, else None."""
+    """Return for each IK solution the closest pair of bodies that violates the clearance, or None."""
     joints = np.array([solution.joints for solution in solutions])
     return worst_collisions(scene, base, joints, np.full(len(joints), time))
 
@@ -409,7 +409,7 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return the error that the targets are not reached; `misses` are the position (m) and angle (rad) errors."""
+    """Return the error for targets that are out of reach; `misses` are the position (m) and angle (rad) errors."""
     names = [part.name for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
     at_limit = [equations.machine.robot.joint_names[k] for k in limited]

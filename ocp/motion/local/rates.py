@@ -160,7 +160,8 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the least joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v. Shape (n, k).
+    """Return the damped least-squares joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v, with
+    the Jacobian G and the weights W of the rates. Shape (n, k).
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
@@ -174,7 +175,7 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
 
 
 def _sample_times(samples: Any, horizon: float) -> Array:
-    """Return sample times from their number or from an array; raise ProblemError unless they cover the horizon."""
+    """Return sample times, given their number or an array; raise ProblemError unless they cover the horizon."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
@@ -191,7 +192,7 @@ def _sample_times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Differential equations of a resolved-rate motion of base and joints, and its outputs, as CasADi functions."""
+    """Differential equations of the base and the joints in resolved-rate control, with outputs, as CasADi functions."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -226,7 +227,7 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all sample times that an integration reaches, and the reason if it stops early."""
+    """Return states and costs at the sample times that an integration reaches, and the reason if it ends early."""
     try:
         problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
         result = _cvodes(problem, times[0], times[1:], tolerance)(x0=first)
@@ -323,7 +324,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return straight motions in joint space from the starts of these motions to (K, joint_size) configurations."""
+        """Return straight motions in joint space from the starts of these motions to configurations (K, joint_size)."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
@@ -368,7 +369,7 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities and pose errors (K, m), and residuals (K,) at time sample k."""
+        """Return Jacobians (K, m, n), task velocities, pose errors (K, m), and the largest errors (K,) at sample k."""
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)
@@ -425,7 +426,7 @@ def track_tasks(
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least joint rates (K, n) for task velocities (K, m); joints stop rather than leave their limits."""
+    """Return damped least joint rates (K, n) for task velocities (K, m), without motion beyond joint limits."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

@@ -43,7 +43,7 @@ GUESS_PLACES = np.append(ROUNDING_SHARE, np.arange(1, 17) / 16)
 
 
 class _Demand(NamedTuple):
-    """Largest demand on an actuator: ratio to its limit, limited quantity, and a `Reason` that describes the demand."""
+    """Largest demand on an actuator: ratio to its limit, name of the limited quantity, and a `Reason` with details."""
 
     ratio: float = 0.0
     quantity: str = ""
@@ -98,7 +98,7 @@ def _moving_joints(plan: SolvedPlan) -> tuple[Any, Array, tuple[Array, ...]]:
 
 
 def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return the reason that describes a plan's largest demand on an actuator, relative to its limit, or None.
+    """Return a `Reason` with a plan's largest demand on an actuator, relative to the limit; None without limits.
 
     The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
     the plan keeps at rest do not count.
@@ -130,7 +130,7 @@ def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointB
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
-    """Return the largest demand beyond a limit on joints whose motion tasks determine; None if no limit is exceeded.
+    """Return the most exceeded limit of joints whose motion the tasks determine; None if they exceed none.
 
     The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
     moves at a random configuration is not moved at almost all configurations: the tasks determine its motion. Divided
@@ -271,8 +271,8 @@ def _slopes(values: Array, times: Array) -> Array:
 
 
 def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
-    """Return the times, as fractions of the horizon, of the middles and ends of the fastest ramps between rest and the
-    self-motion at the ends of a plan. Limited jerks switch at these times.
+    """Return the times, as fractions of the horizon, of the middles and ends of the fastest velocity ramps between rest
+    and the self-motion at the ends of a plan. Limited jerks switch at these times.
     """
     horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
     rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
@@ -287,8 +287,8 @@ def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_row
 
 
 def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan, end: int) -> Array:
-    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the start, if
-    `end` is 0, or at the end, if it is -1.
+    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the start (`end`
+    0) or at the end (`end` -1).
     """
     stretch = request.stretches[end]
     if stretch.equations is None:
@@ -316,7 +316,7 @@ def _add_demand(error: SolveError, demand: Reason | None) -> None:
 
 
 def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> None:
-    """Set the initial guess of the states and controls of a problem to a motion that ignores actuator limits."""
+    """Use a motion that ignores actuator limits as the initial guess of the states and controls of a problem."""
     shape, fractions = (mesh.intervals, len(GUESS_PLACES)), _guess_fractions(mesh).ravel()
     sample = unlimited.solution.at_fraction(fractions)
     pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0

@@ -51,11 +51,11 @@ class Solver:
         return False
 
     def reaches_limits(self, solution: Solution) -> bool:
-        """Return whether joints of a solution reach their limits, where full turns of joints may change the cost."""
+        """Return whether joints of a solution reach their limits, so that full turns of joints may reduce the cost."""
         return True
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes its audit, with the rejection reasons, the most frequent first."""
+        """Return the error to raise if no candidate passes its audit, with reasons, the most frequent first."""
         reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
         listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
@@ -69,7 +69,7 @@ class Solver:
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, candidates, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, in which the other candidates are listed as well."""
+        """Return the first candidate as a plan, which also lists the other candidates."""
         raise NotImplementedError
 
 
@@ -110,7 +110,7 @@ class CandidateQueue:
 
     @property
     def exhausted(self) -> bool:
-        """Whether no candidate has passed or collided, although failed candidates have used up the allowed time.
+        """Whether failed candidates have used up the allowed time while no candidate has passed or collided.
 
         An explicit time limit of the caller takes the place of the allowed time.
         """
@@ -161,7 +161,7 @@ class CandidateQueue:
         self.candidates += [each.with_rejection(Reason(Rejection.DUPLICATE)) for batch in waiting for each in batch]
 
     def plan(self) -> SolvedPlan:
-        """Return the plan of the best candidate that passed, which also lists the rejected candidates with the reasons.
+        """Return the best candidate that passed as a plan, which also lists the other candidates with their reasons.
 
         Raises:
             SolveError: No candidate passed.
@@ -181,7 +181,7 @@ class CandidateQueue:
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> list[Candidate] | None:
-        """Return the candidates that converged to a candidate's motion on its first mesh; None for a new motion."""
+        """Return the group of earlier candidates that were solved to the same motion; None if the motion is new."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(first.seed is candidate.seed for first, *_ in self._motions):
@@ -197,7 +197,7 @@ class CandidateQueue:
         return None
 
     def _prune(self, candidate: Candidate) -> Reason | None:
-        """Return the reason why a candidate need not be advanced; None if the candidate must be advanced."""
+        """Return the reason not to solve a candidate any further; None if it must be solved further."""
         settings, stage, best = self.settings, candidate.stage, self.cost
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
@@ -219,7 +219,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost (and path, if costlier ones are kept) has passed its audit."""
+        """Return whether a candidate of equal cost (and equal path, if costlier motions are included) passed before."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.total - c.total) <= self.settings.same_cost * c.total]
         if not self._always_costlier or candidate.solution is None:
@@ -227,7 +227,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _store_or_push(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store a candidate that was advanced if it is finished or rejected; else push it to the queue again."""
+        """Store a candidate after one more stage if it is finished or rejected; else put it back into the queue."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED
@@ -247,7 +247,7 @@ class CandidateQueue:
             self._push(advanced)
 
     def _resume_duplicates(self, rejected: Candidate) -> None:
-        """Queue again the duplicates that waited for the result of a candidate which was now rejected."""
+        """Queue again the candidates that were duplicates of a candidate which has now been rejected."""
         self._push_turned(rejected)
         same = [motion for motion in self._motions if motion[0].seed is rejected.seed]
         self._motions = [motion for motion in self._motions if motion[0].seed is not rejected.seed]
@@ -255,12 +255,12 @@ class CandidateQueue:
             self._push(candidate)
 
     def _push_turned(self, candidate: Candidate) -> None:
-        """Queue the candidates whose initial guesses differ from a given candidate's guess by full turns of joints."""
+        """Queue the candidates whose initial guesses differ from that of a candidate by full turns of joints."""
         for turned in self._turned.pop(id(candidate.seed), []):
             self._push(turned)
 
     def _update_coarse_error(self, coarse: Candidate, fine: Candidate) -> None:
-        """Update the estimated cost error of the coarse mesh, unless the candidate converged to another motion."""
+        """Update the estimated cost error of coarse meshes from a candidate's solutions on a coarse and a fine mesh."""
         assert coarse.solution is not None
         assert fine.solution is not None
         if self.solver.same_path(coarse.solution, fine.solution):

@@ -40,7 +40,7 @@ from ocp.motion.result.candidate import (
 )  # fmt: skip
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
-from ocp.motion.result.solved_plan import Part, SolvedPlan
+from ocp.motion.result.solved_plan import Part, SolvedPlan, deviation_cost
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -105,7 +105,7 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks must be relaxed, as their Jacobian is nearly singular along a local motion."""
+        """Return whether the tasks must be relaxed, because their Jacobian is nearly singular on a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
         return self._can_relax and any(sample.is_nearly_singular for sample in samples)
 
@@ -235,7 +235,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """If a candidate passed its audit with a fixed start, return [a copy with a free start], else an empty list."""
+        """Return a candidate whose guess is an audited motion with a fixed start, but whose start is free; else []."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -270,7 +270,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, its first mesh, and a solver set up for guesses that cost about `cost`."""
+        """Return the problem of a candidate, its first mesh, and a solver for guesses with a cost of about `cost`."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
@@ -295,7 +295,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the start configuration, nan for free joints; joints that move separated bodies are free too."""
+        """Return the start configuration, nan for free joints; those that move bodies to be separated are free."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -417,7 +417,7 @@ class CandidateSolver(Solver):
         return self._collision_reason(collisions[0]) if collisions else None
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
-        """Return the collisions along the local motion of an initial guess, in order of severity."""
+        """Return the collisions along the local (resolved-rate) motion of an initial guess, in order of severity."""
         constraints, collisions = self.request.clearance_constraints, list[Collision]()
         for motion in seed.local if constraints is not None else ():
             assert constraints is not None
@@ -430,7 +430,7 @@ class CandidateSolver(Solver):
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
-        """Return the number of collision-free configurations at a time, or an error if there are none (cached)."""
+        """Return the number of collision-free configurations at a time, or an error if there are none; cached."""
         if time not in self._clear_counts:
             self._clear_counts[time] = count_clear_configurations(self.request, time)
         return self._clear_counts[time]
@@ -444,7 +444,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes, with details of the lowest-cost candidate that collides."""
+        """Return the error to raise if no candidate passes, with details of the lowest-cost candidate that collides."""
         error = super().failure(candidates)
         colliding = [c for c in candidates if c.reason is not None and c.reason.kind is Rejection.COLLISION]
         if not colliding:
@@ -457,7 +457,7 @@ class CandidateSolver(Solver):
         return error
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, in which the other candidates are listed as well."""
+        """Return the first candidate as a plan, which also lists the other candidates."""
         best = candidates[0]
         parts = tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in self.motion.stretches)
         assert best.solution is not None
@@ -465,6 +465,7 @@ class CandidateSolver(Solver):
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)
         request, whole = self.request, self.request.whole or self.request.machine
         extended = [replace(c, start=all_joints(whole.robot, request.held, c.start)) for c in candidates]
+        extended[0] = replace(extended[0], cost=extended[0].cost - deviation_cost(best.solution, parts))
         audits = {} if best.audit is None else {audit_key(): best.audit}
         plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)
         return plan.with_targets(request.tasks)

@@ -125,7 +125,7 @@ def plan_goal(
 
 
 def has_only_target(goal: Goal) -> bool:
-    """Return whether a goal states only a target: no tasks on the way, and no change of machine or base."""
+    """Return whether a goal is only a target, without tasks, another machine (load) or base pose of its own."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -156,7 +156,7 @@ def _goal_request(
 
 
 def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPlan:
-    """Plan the motion of a standing machine that makes given footsteps; see `steps_problem`.
+    """Plan the motion of a standing machine that makes given footsteps, as one optimal control problem with phases.
 
     Args:
         machine: Machine of the first stance, `steps.stances[0]`.
@@ -179,7 +179,7 @@ def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPl
 def plan_capture(
     machine: Machine, capture: Capture, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> PhasedPlan:
-    """Plan the capture of a tumbling body by a free-floating chaser; see `capture_problem`.
+    """Plan the capture of a tumbling body by a free-floating chaser, as one optimal control problem with two phases.
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -349,7 +349,7 @@ class _StandingSolver(Solver):
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, in which the other candidates are listed as well."""
+        """Return the first candidate as a plan, which also lists the other candidates."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)

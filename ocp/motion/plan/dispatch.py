@@ -98,9 +98,11 @@ def plan(
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
             "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
             "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
-            must be poses that leave at most two degrees of freedom undetermined. If more are, joints that also carry
-            another limb, such as a torso, are held at rest (see `search.search`). On a floating base, the motions come
-            from a search over exact states without a bound (see `search.cells`), which also passes singularities.
+            must be poses. If they leave more than two degrees of freedom undetermined, joints that also carry another
+            limb, such as a torso, are held at rest (see `search.search`). If there are none, motions from all solutions
+            of inverse kinematics are compared, and the bound is loose (see `search.task_search.tool_rate_bound`). On a
+            floating base, the motions come from a search over exact states without a bound (see `search.cells`), which
+            also passes singularities.
             "segments": as "global"; if no single motion does the tasks, in the fewest segments, between which an arm on
             a fixed base moves to another configuration while the tasks wait.
         seed: Seed of all random numbers.
@@ -374,7 +376,7 @@ def _goal_problem(
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read a plan of any kind from a file; see `Plan.load`."""
+    """Read a plan of any kind from a file that `Plan.save` has written."""
     arrays = read_arrays(path)
     if "path" in arrays:
         return PathPlan.of_arrays(path, arrays)

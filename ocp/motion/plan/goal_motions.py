@@ -286,7 +286,7 @@ class _PathProblem:
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the optimal control problem of a motion between the ends of the path, with or without clearance."""
+        """Declare the problem of an optimal motion between the ends of the path, with clearance constraints or none."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
@@ -321,7 +321,7 @@ class _PathProblem:
         return _audit_candidate(self.task, self.motion.solution(problem, method), self.path)
 
     def without_stops(self) -> Candidate:
-        """Return an audited, locally optimal motion near the collision-free path, without stops at its corners."""
+        """Return an audited, locally optimal motion near the collision-free path that does not stop at corners."""
         if has_spline_cost(self.task.request.cost) and not self.task.is_fastest:
             spline = _spline_candidate(self.task, self.path, self.fixed)
             if spline.passed:
@@ -366,7 +366,7 @@ def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Can
 
 
 def cost_bound(task: GoalTask, horizon: float) -> float | None:
-    """Return a lower bound of the cost of any motion to a goal; None if the machine moves at start or end.
+    """Return a lower bound of the cost of any motion to a goal; None if the joints may move at the start or end.
 
     Straight motions have the least length and squared velocities. Each joint by itself needs the least time and, within
     its acceleration limit, the least squared velocity.

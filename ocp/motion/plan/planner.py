@@ -50,8 +50,8 @@ from ocp.motion.search.held_joints import (
     release_obstructing,
     restore_error,
 )
-from ocp.motion.search.search import checked_bound
-from ocp.motion.search.task_search import TaskSearch
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, checked_bound
+from ocp.motion.search.task_search import TaskSearch, require_poses, tool_rate_bound
 from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
@@ -84,9 +84,15 @@ def plan_from_configurations(
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
         return _final_plan(queue, solver), None
-    if request.search == "global":
+    if request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS:
+        require_poses(request)
+        queue.run(candidates_from(solver, motions), include_costlier=True)
+        if queue.passed:
+            return _final_plan(queue, solver), tool_rate_bound(request) or None
+    search = None
+    if request.search == "global" and request.redundancy <= MAX_FREE_DIRECTIONS:
         report("global search")
-    search = TaskSearch(request, motions) if request.search == "global" else None
+        search = TaskSearch(request, motions)
     if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:
@@ -104,7 +110,7 @@ def plan_from_configurations(
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the candidate that costs least by the cost function of the request.
+    """Return the plan of the candidate that costs least in terms of the cost function of the request.
 
     If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
     their costs before. If no motion passed, raise SolveError.
@@ -121,7 +127,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates whose guesses are local motions; those that satisfy the tasks come first, sorted by cost.
+    """Return candidates with local (resolved-rate) motions as guesses, those that satisfy the tasks first, by cost.
 
     The cost includes that of the approach from the configuration `near` of the request.
 
@@ -196,9 +202,9 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
     for finer in (False, True):
         if finer and not (queue.passed and search.refine_samples(everywhere=True)):
             break
-        for include_costlier in (False, True):
-            if _solve_classes(queue, solver, search, include_costlier):
-                return
+        solved = any(_solve_classes(queue, solver, search, costlier) for costlier in (False, True))
+        if queue.cost <= search.near_cost or (finer and solved):
+            return
     if queue.passed:
         for bound, time, joints in search.unresolved(queue.cost):
             words = f"motions near this configuration at {time:.4g} s may cost {bound:.6g}; the search found no path"
@@ -209,7 +215,7 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
 
 def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
-    """Solve the motions of a global search; return whether a plan costs so little that none of them promises less.
+    """Solve candidates from a global search; return whether one has passed and no other one promises to cost less.
 
     Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
     free start and, at last, with relaxed tasks.
@@ -235,7 +241,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
+    """Solve candidates of a floating-base machine, from a forward search over grid cells and from local motions.
 
     If there are none, raise the error of the `CellSearch`.
     """
@@ -270,7 +276,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve colliding candidates again: with their bodies separated, or with a collision-free start that is fixed.
+    """Solve candidates again: with separation constraints on colliding bodies, or from fixed collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start

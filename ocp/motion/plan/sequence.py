@@ -54,13 +54,13 @@ class _Junction(NamedTuple):
 
     @classmethod
     def end_of(cls, plan: SolvedPlan, smooth: bool) -> _Junction:
-        """Return the state at the end of a motion; unless `smooth`, velocities may jump there and count as zero."""
+        """Return the state at the end of a plan, with zero velocities unless these must be continuous (`smooth`)."""
         at = plan.at(plan.horizon)
         return cls(at["joints"], at.get("base", np.zeros(0)), _junction_velocity(at["rates"], smooth))
 
 
 def _junction_velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity where two motions meet; "rest" if it is zero or, unless `smooth`, may jump there."""
+    """Return the joint velocity to keep where motions meet; "rest" if it is zero or need not be kept (not `smooth`)."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
@@ -224,7 +224,7 @@ def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal at the joints at which the next task's plan starts; if they miss the goal, return it unchanged."""
+    """Return a goal with the joint positions at the start of the next task's plan, unchanged if they miss the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (
         goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START
@@ -326,7 +326,7 @@ def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
 
 
 def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
-    """Return the part of a task between two times, with `begin` as the new time 0; None if this part is empty."""
+    """Return the part of a task between two times, as a task that starts at time 0; None if this part is empty."""
     first, last = max(task.begin, begin), min(task.end, end)
     if last <= first:
         return None

@@ -269,7 +269,7 @@ class _WaypointPlanner:
         return [-(-count // settings.first_steps), *strides], 2
 
     def _search_with_stride(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
-        """Return a search over every `stride`-th waypoint; the stride doubles while too many charts are needed.
+        """Return a search over every `stride`-th waypoint; double the stride until few enough charts are needed.
 
         Return None if it has no more waypoints than a known search.
         """
@@ -300,7 +300,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search for paths over chosen waypoints; all redundant joints but one have several fixed values."""
+        """Return the search for paths over chosen waypoints; all redundant joints but one take fixed values."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -378,7 +378,7 @@ class _WaypointPlanner:
         return TipTask(position=self.positions[number], orientation=self.rotations[number])
 
     def _seeds(self, number: int) -> Array:
-        """Return inverse kinematics solutions at a waypoint, from the cache if possible."""
+        """Return inverse kinematics solutions at a waypoint, computed at most once for each waypoint."""
         if number not in self._seed_cache:
             try:
                 seeds = self.manifolds.seeds(number, self.limits.joints, self.seed + number)
@@ -389,7 +389,7 @@ class _WaypointPlanner:
         return self._seed_cache[number]
 
     def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
-        """Interpolate joint positions at all waypoints, and shift them by full turns into the limits. Shape (N, n)."""
+        """Interpolate the configurations (N, n) of all waypoints between those that were searched, within limits."""
         numbers = np.arange(len(self.positions))
         path = np.concatenate([segment.joints for segment in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
@@ -432,7 +432,7 @@ class _WaypointPlanner:
 
 
 def _poses(waypoints: Waypoints, size: int) -> PathPoses:
-    """Return the poses of waypoints and the largest step of each of `size` joints, after checking all of them."""
+    """Check waypoints, and return their poses and the largest allowed step of each of `size` joints."""
     step = require.broadcast("step", waypoints.step, size, "joints", entries="numbers", sign="positive")
     positions = require.array("positions", waypoints.positions, ("waypoints", 3), least=2)
     quaternions = require.array("quaternions", waypoints.quaternions, ("waypoints", 4), least=2)

@@ -72,14 +72,14 @@ class Reason:
 
     @property
     def fault(self) -> dict[str, Any]:
-        """Name, value, limit and time of the offending item, as fields of an exception."""
+        """Name, value, limit and time of the violation, as a dictionary of the fields of an exception."""
         return {name: getattr(self, name) for name in ("name", "value", "limit", "time")}
 
     def __str__(self) -> str:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """Return the reason as plain data for a file."""
+        """Return the reason for the rejection as plain data for a file."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
@@ -95,7 +95,7 @@ class Reason:
 
     @classmethod
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
-        """Return a reason from an exception: its first line, and its value, limit and time if they are numbers."""
+        """Return a rejection reason from an exception's first line and its value, limit and time if numeric."""
         if isinstance(error, TimeLimitReached):
             return cls(kind, "the time limit passed", "time_limit")
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
@@ -208,7 +208,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the rejected candidate: for `reason` or, if colliding bodies were separated, for their collision."""
+        """Return the candidate as rejected for `reason` or, if a separation was tried, for the collision before it."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)

@@ -72,7 +72,7 @@ PYRAMID_SIDES = 32
 
 
 class Requirements(NamedTuple):
-    """Requirements of one kind at M samples: sum of coefficients times sizes of uncertainties <= slack.
+    """Inequalities of one kind at M samples: sum of coefficients times sizes of uncertainties <= slack.
 
     Attributes:
         name: Name of the limited quantity.
@@ -91,12 +91,12 @@ class Requirements(NamedTuple):
     joint: str = ""
 
     def coefficient(self, uncertainty: str) -> Array:
-        """Return the coefficients of an uncertainty, zero if the requirement does not depend on it. Shape (M,)."""
+        """Return the largest loss of margin per unit of an uncertainty, zero if it has no effect. Shape (M,)."""
         return self.coefficients.get(uncertainty, np.zeros(self.slack.shape))
 
 
 class Range(NamedTuple):
-    """Largest allowed size of an uncertainty, or common factor of several sizes, and the limit that it reaches.
+    """Largest allowed size of one uncertainty, or common factor of several sizes, and the limit that it reaches first.
 
     Attributes:
         size: Largest size (kg, share of the torque limits, or m), or factor.
@@ -181,7 +181,7 @@ def describe_size(name: str, size: float, up: bool = False) -> str:
 
 @interruptible
 def margin_of_plan(plan: Plan, uncertainty: Any = None, tolerance: float | None = None) -> Margin:
-    """Return the margin of a plan; see `Plan.margin`."""
+    """Return how far uncertain quantities may differ from the model of a plan, alone and together."""
     stated = checked_uncertainty(uncertainty)
     if tolerance is not None:
         tolerance = require.nonnegative("margin: tolerance", tolerance, unit="m")
@@ -202,7 +202,7 @@ def margin_of_plan(plan: Plan, uncertainty: Any = None, tolerance: float | None 
 
 
 class _Stacked(NamedTuple):
-    """Requirements of all kinds at all M samples: sum of coefficients times sizes of uncertainties <= slack."""
+    """Inequalities of all kinds at all M samples: sum of coefficients times sizes of uncertainties <= slack."""
 
     coefficients: dict[str, Array]  # of each uncertainty, (M,)
     slack: Array
@@ -216,14 +216,14 @@ class _Stacked(NamedTuple):
         return cls(coefficients, slack, times, np.repeat([row.name for row in rows], [row.slack.size for row in rows]))
 
     def largest(self, growth: Array, left: Array) -> Range:
-        """Return the largest factor for which factor * growth (M,) <= left (M,), and the requirement that ends it."""
+        """Return the largest factor with factor * growth (M,) <= left (M,), and the requirement that limits it."""
         factors = np.full(growth.shape, np.inf)
         np.divide(np.maximum(left, 0.0), growth, out=factors, where=growth > 0)
         row = int(factors.argmin())
         return Range(float(factors[row]), str(self.labels[row]), float(self.times[row]), row)
 
     def grow(self, weights: Mapping[str, float], stated: list[str]) -> tuple[dict[str, float], list[Range]]:
-        """Return the sizes of uncertainties that are allowed together, and the limits that end their growth in turn.
+        """Enlarge all uncertainties until limits stop them; return their sizes, and these limits in the order reached.
 
         All grow in proportion to their weights: first the stated ones, up to their weights if there are others, then
         the others. An uncertainty stops at the first requirement that allows no more of it.
@@ -377,7 +377,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     def add(
         name: str, most: float, value: Array, change: Array, friction: Array | None = None, joint: str = ""
     ) -> None:
-        """Add the requirement value + payload times change + share of friction <= most, unless `most` is infinite."""
+        """Require `value` <= `most`; `change` and `friction` are its growth per unit of payload and friction error."""
         if np.isfinite(most):
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})
@@ -430,7 +430,7 @@ def _loads(machine: Machine, arguments: Mapping[str, Any]) -> Sampler:
 
 
 def _ground_rows(machine: Standing, limits: Limits) -> list[tuple[str, Array, float]]:
-    """Return names, rows w (6,) and limits c of the conditions w . reaction <= c on the reaction of the ground.
+    """Return names, row vectors w (6,) and limits c of the inequalities w . reaction <= c on the ground reaction.
 
     The reaction has the moment about the world's origin and the force. While the vertical force is positive, the zero
     moment point (-reaction[1], reaction[0]) / reaction[5] satisfies linear conditions exactly if the reaction does.

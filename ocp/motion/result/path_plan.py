@@ -170,7 +170,7 @@ class PathPlan(Plan):
         return Audit("path through waypoints", tuple(findings + optimality), undecided, **options)
 
     def _optimality(self) -> tuple[list[Finding], str]:
-        """Return the finding on first-order conditions, and the reason why a local minimum is undetermined, or ""."""
+        """Return the finding on first-order optimality, and the reason why a local minimum is undetermined, or ""."""
         if self.poses is None or self.step_cost is None:
             return [], "the cost of its steps is unknown"
         scene = None if self.constraints is None else self.constraints.scene
@@ -285,7 +285,7 @@ def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
 def _largest(
     name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
 ) -> Finding:
-    """Return the audit finding about the largest of the values, whose first axis is time; negative ones count as 0."""
+    """Return the audit finding about the largest of the values, whose first axis is time; below zero counts as 0."""
     if not values.size:
         return Finding(name, 0.0, limit, unit=unit)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

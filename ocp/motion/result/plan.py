@@ -175,9 +175,9 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions of the optimal control problems that form the plan, at rising times (M,), s.
+        """Return the solved optimal control problems of the plan, each with those of the times (M,), s, that lie in it.
 
-        Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
+        Each comes with the suffix of the names of its states and with its times, shape (K,), s; all K add up to
         M. The list is empty for a plan that solves no optimal control problem.
         """
 
@@ -185,7 +185,7 @@ class Plan(ABC):
 
     @interruptible
     def audit(self, **settings: Any) -> Audit:
-        """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings."""
+        """Check the motion independently of its solver (`ocp.audit.audit.audit`); results are cached by settings."""
         key = audit_key(**settings)
         audit: Audit = self._audits.get(key) or self._audit(**settings)
         if all(finding.name != ENDS for finding in audit.findings):  # a planner's audit of the solution has no such row
@@ -309,7 +309,7 @@ class Plan(ABC):
     # ---- figures -----------------------------------------------------------------------------------------------------
 
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
-        """Plot position, velocity and acceleration of every joint over time, with limits; see `view.plots.plot_plan`.
+        """Plot position, velocity and acceleration of every joint over time with limits, by `view.plots.plot_plan`.
 
         The plan is blue; what it is compared with, another plan, a result of `resolve`, or several by name, is orange.
         A notebook shows the figure, `.savefig("plan.png")` writes it, and `figure=plt.figure()` draws into a window.
@@ -342,7 +342,7 @@ class Plan(ABC):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a plan from a file that `save` has written; candidates other than the plan have no solutions.
+        """Read a plan from a file that `save` has written; candidates other than the plan come without solutions.
 
         The problem is declared again from the request by the planner's own code, so that the audit checks the motion
         against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as

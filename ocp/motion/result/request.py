@@ -73,7 +73,7 @@ TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingO
 
 
 def _machine_of(arguments: Mapping[str, Any]) -> Machine:
-    """Return the machine among the arguments of a problem builder."""
+    """Return the machine that a problem builder's arguments contain."""
     if "steps" in arguments:
         steps: Steps = arguments["steps"]
         return steps.stances[0]
@@ -140,7 +140,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request, and store the request in it, so that files can rebuild it.
+    """Declare the problem of a request, and store the request in the problem, so that files can rebuild the problem.
 
     Args:
         request: The request.

@@ -62,7 +62,7 @@ class Reconfiguration:
 
 
 class Piece(NamedTuple):
-    """One of several consecutive plans, with its start time (s) and its name."""
+    """One of several consecutive plans, with its start time (s) and the name of its motion."""
 
     begin: float
     plan: SolvedPlan
@@ -86,7 +86,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def _plans(self) -> tuple[SolvedPlan, ...]:
-        """Plans whose costs, bounds and candidates count for the whole plan."""
+        """Plans of all pieces; their costs and bounds are summed, and their candidates listed together."""
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ class ConsecutivePlans(Plan):
         return evaluate_parts([piece.begin for piece in pieces], times, size, values)
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions of all consecutive plans; see `Plan.solved_parts`."""
+        """Return the solved problems of all plans, each with those of the times (M,), s, that lie in it."""
         pieces = self.pieces
         which = segment_index([*(piece.begin for piece in pieces), np.inf], times)
         parts: list[tuple[Solution, str, Array]] = []
@@ -253,7 +253,7 @@ class SequencePlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
+        """Return the arrays of the plan's file by name; a prefix of the name identifies the motion of an array."""
         arrays = record_arrays(self.kind, {"phases": list(self.phases), "smooth": self.smooth})
         for number, plan in enumerate(self.parts):
             arrays |= {f"part {number}/{name}": array for name, array in plan.arrays(path).items()}
@@ -358,7 +358,7 @@ class SegmentedPlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
+        """Return the arrays of the plan's file by name; a prefix of the name identifies the motion of an array."""
         record = {
             "start_times": list(self.start_times),
             "reconfigurations": [

@@ -17,7 +17,7 @@ from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES
+from ocp.motion.builders.tool_motion import CLOCK, ERRORS, PACE, SLOPES, START_ERRORS
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
@@ -38,11 +38,25 @@ TARGET_TIMES = 401
 
 
 class Part(NamedTuple):
-    """Time interval of a plan, s, and the suffix of the state and control names for this interval in the solution."""
+    """Time interval of a plan, s, and the suffix of the names of states and controls in this interval."""
 
     begin: float
     end: float
     suffix: str
+
+
+def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
+    """Return the part of the cost of a solution by which relaxed tasks limit the deviations from their targets."""
+    breaks = solution.control_interpolant.breaks
+    points, weights = np.polynomial.legendre.leggauss(len(solution.control_interpolant.nodes))
+    widths = np.diff(breaks)
+    fractions = breaks[:-1, None] + widths[:, None] * (points + 1) / 2
+    shares = (widths[:, None] * weights / 2).ravel()
+    errors = {part.suffix: part.end - part.begin for part in parts if f"{ERRORS}{part.suffix}" in solution.controls}
+    sample = solution.at_fraction(np.clip(fractions.ravel(), 0.0, 1.0)) if errors else {}
+    total = sum(seconds * shares @ (sample[f"{ERRORS}{suffix}"] ** 2).sum(axis=1) for suffix, seconds in errors.items())
+    starts = (values[-1] for name, values in solution.states.items() if name.startswith(START_ERRORS))
+    return float(total + sum((values**2).sum() for values in starts)) / 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,10 +80,10 @@ class SolvedPlan(Plan):
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def cost(self) -> float:
-        """Value of the cost function for the motion."""
-        return self.solution.cost
+        """Value of the cost function for the motion; deviations from relaxed tasks, within tolerance, cost nothing."""
+        return self.solution.cost - deviation_cost(self.solution, self.parts)
 
     @property
     def horizon(self) -> float:
@@ -107,7 +121,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._evaluate(times, size, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solution once for each time interval (part) of the plan; see `Plan.solved_parts`."""
+        """Return for each part its solution, the suffix of variable names, and the given times on its own clock."""
         which = segment_index([*self._begins, np.inf], times)
         return [
             (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)
@@ -120,7 +134,7 @@ class SolvedPlan(Plan):
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the duration of the tasks that has passed; see `Plan.task_share`."""
+        """Return the fraction of the duration of the tasks that has passed at times (M,), s. Shape (M,)."""
         if CLOCK not in self.solution.states:
             return super().task_share(times)
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
@@ -149,7 +163,7 @@ class SolvedPlan(Plan):
     # ---- targets -----------------------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
-        """Return the plan with the target poses of its tasks, sampled at TARGET_TIMES times."""
+        """Return the plan with the target poses of its tasks, sampled at evenly spaced times."""
         return replace(self, targets=self._targets_of(tasks, np.linspace(0.0, self.horizon, TARGET_TIMES)))
 
     def targets_at(self, times: Any) -> tuple[Target, ...]:
@@ -254,7 +268,7 @@ class SolvedPlan(Plan):
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control with respect to the horizon fraction. Shape (M, n)."""
+        """Return the derivative of a state or control with respect to the fraction of the horizon. Shape (M, n)."""
         is_state = name in self.solution.states
         pool = self.solution.states if is_state else self.solution.controls
         interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
@@ -278,7 +292,7 @@ class SolvedPlan(Plan):
         return [part.begin for part in self.parts]
 
     def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a function of a part of the plan and of fractions of the horizon of this part, at times (M,)."""
+        """Evaluate, at times (M,), a function of a part of the plan and of fractions of the horizon of this part."""
         return evaluate_parts(
             self._begins,
             times,
@@ -305,7 +319,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def machines(self) -> tuple[Machine, ...]:
-        """Machine of each phase; the first phase's machine for all phases if the user declared the problem."""
+        """Machine of each phase; if the user declared the problem, the machine of the first phase for all phases."""
         machines = machines_of_phases(self.request)
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 

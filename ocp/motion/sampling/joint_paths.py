@@ -67,7 +67,7 @@ PROOF = StraightMotionSettings()
 
 
 class StraightMotions:
-    """Collision proofs for straight joint motions of a machine on a fixed base among fixed obstacles.
+    """Collision checker that proves clearances on straight joint motions, for a fixed base and fixed obstacles.
 
     Attributes:
         scene: Collision scene; None if nothing can collide.
@@ -127,7 +127,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Prove straight motions collision-free by bisection; unset the marks `clear` of motions that may collide.
+        """Prove straight motions collision-free by bisection; set `clear` to False for motions that may collide.
 
         `lines` are the starts and ends of the motions, `sizes` the approach and turning of each pair of bodies over
         each whole motion, `intervals` the number of the motion, the middle and the width of each interval.
@@ -174,7 +174,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of all bodies on K straight motions, at one fraction of the length of each motion."""
+        """Return the frames of all bodies on K straight motions, at a given fraction of the length of each motion."""
         starts, ends = lines[0][motion], lines[1][motion]
         joints = starts + places[:, None] * (ends - starts)
         base = np.broadcast_to(self.scene.machine.base_home(), (len(joints), 0))  # type: ignore[union-attr]
@@ -239,7 +239,7 @@ def shorten(motions: StraightMotions, path: Array, scale: Array, *, random: np.r
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array) -> bool:
-    """Return whether collision-free straight motions at equal fractions of two paths prove the paths homotopic.
+    """Return whether two paths count as homotopic: straight motions between equal fractions of them are collision-free.
 
     Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses.
     """
@@ -338,7 +338,7 @@ OPTIMISATION = LengthSettings()
 
 
 def optimise_length(motions: StraightMotions, path: Array, scale: Array, *, limits: tuple[Array, Array]) -> Array:
-    """Minimise the length of a path locally; each straight motion of the result is proven collision-free.
+    """Minimise the length of a path locally; all straight motions of the resulting path are proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -390,7 +390,7 @@ def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -
 def _length_step(
     motions: StraightMotions, chain: Array, scale: Array, limits: tuple[Array, Array], inertia: float
 ) -> Array:
-    """Return displacements of a path's corners that minimise an upper bound of its length under linear constraints.
+    """Return displacements of a path's corners that minimise an upper bound of the length under linear constraints.
 
     The clearance constraints are linearised. Shape (m + 1, n).
     """
@@ -424,7 +424,7 @@ def _length_step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point z nearest to a target in a polyhedron, `rows` z >= `least`, that contains the origin."""
+    """Return the point z of the polyhedron `rows` z >= `least`, which contains the origin, nearest to a target."""
     needed = least - rows @ target
     if needed.max(initial=0.0) <= 0:
         return target

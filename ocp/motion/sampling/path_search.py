@@ -40,7 +40,7 @@ LONGEST_EDGE_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Request for a search for a path from a start to goals by random trees.
+    """Problem of finding a collision-free joint path from a start to one of several goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.
@@ -57,7 +57,7 @@ class TreeSearch:
     scale: Array
 
     def path(self, joints: Array) -> JointPath:
-        """Convert corners (M, n) of a path from the start to a goal to a `JointPath` with goal index and length."""
+        """Convert the corners (M, n) of a path to a `JointPath`, with the path's length and the index of its goal."""
         goal = int(np.abs(self.goals - joints[-1]).max(axis=1).argmin())
         return JointPath(joints, goal, path_length(joints, self.scale))
 
@@ -212,7 +212,7 @@ def find_paths(
 
 
 def search_paths(search: TreeSearch, *, seed: int, settings: PathSearchSettings) -> Iterator[JointPath]:
-    """Yield collision-free paths, shortened but not optimised, as they are found; see `find_paths`.
+    """Yield collision-free paths from a start to goals as they are found, shortened but not yet optimised.
 
     Raises:
         TimeLimitReached: The time limit has passed.
@@ -237,7 +237,7 @@ def search_paths(search: TreeSearch, *, seed: int, settings: PathSearchSettings)
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:
-    """Add a path to a list sorted by length, and keep only the shortest path of each homotopy class."""
+    """Add a path to a list sorted by length, which keeps only the shortest path of each homotopy class."""
     others = []
     for other in paths:
         if other.goal == path.goal and same_class(search.motions, other.joints, path.joints, search.scale):

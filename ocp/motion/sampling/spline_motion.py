@@ -240,7 +240,7 @@ class _State:
 
 
 class _Step(NamedTuple):
-    """Control points (K, n) and duration, s, after a step, and the relative decrease of the cost that it predicts."""
+    """Result of an optimisation step: control points (K, n), duration, s, and predicted relative decrease of cost."""
 
     points: Array
     duration: float
@@ -286,7 +286,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if self.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return p, L for which |L c|^2 / T^p is the cost of a squared derivative; c: control points, T: duration."""
+        """Return p, L: the integral of a squared derivative is |L c|^2 / T^p (c: control points, T: duration)."""
         places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
@@ -323,7 +323,7 @@ class _Search:
         return np.asarray(breaks)
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix that maps control points to a derivative at M fractions of the duration. Shape (M, K)."""
+        """Return the matrix (M, K) that maps control points to a derivative at M fractions of the duration."""
         knots = self.knots[order : len(self.knots) - order]
         return scipy.interpolate.BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
@@ -347,7 +347,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a path, and the duration: if free, the shortest within joint limits."""
+        """Return control points on a path and the duration; a free duration is the least that joint limits allow."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -384,7 +384,7 @@ class _Search:
         return _State(points, duration, cost, matrix.tocsr(), np.concatenate(usages), allowed)
 
     def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the linearised limits of velocity, acceleration and jerk, each in both directions."""
+        """Yield the linearised limits of velocity, acceleration and jerk, both upper and lower."""
         for order in range(1, self.degree + 1):
             limited = np.flatnonzero(np.isfinite(self.largest[order - 1]))
             if not len(limited):
@@ -405,7 +405,7 @@ class _Search:
         return matrix, np.zeros(len(at)), 2 - distance / margin, 0.5
 
     def _torque_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the linearised limits of torques, in both directions, and of powers, at the knots."""
+        """Yield the linearised upper and lower limits of torques, and those of powers, at the knots."""
         torques, share = self.limits.torques, self.settings.torque_share
         first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
         values, slopes = torques.linearise(self.at_torques[0] @ points, first, second)
@@ -421,7 +421,7 @@ class _Search:
             yield sign * matrix[rows], sign * by_duration.ravel()[rows], sign * usages, (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Convert the Jacobian of constraints in joint positions (R, n) to their Jacobian in the control points.
+        """Convert the Jacobian (R, n) of constraints in the joint positions to the Jacobian in the control points.
 
         `basis` has the values of the K basis functions at the sample of each constraint. Shape (R, K).
         """

@@ -1,9 +1,9 @@
 """Grids of nodes along a path that are fine enough to resolve how the limits vary along the path.
 
-The bounds between the segments of the path are nodes. Intervals are halved until every limit row at the fastest steady
-speed varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds
-up, so that the jerk can change at the right time. Towards rest, where v ~ s^(2/3), they shrink in proportion to the
-distance.
+The bounds between the segments of the path are nodes. Intervals are halved until every limit row varies almost linearly
+between nodes at the fastest steady speed, or at the fastest speed that a motion can reach there. They also last only a
+fraction of the time in which the acceleration builds up, so that the jerk can change at the right time. Towards rest,
+where v ~ s^(2/3), they shrink in proportion to the distance.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Grid:
 
     @cached_property
     def rows(self) -> Rows:
-        """Coefficients of all limits at all nodes, then just before the nodes where segments meet."""
+        """Coefficients of all limits at all nodes, followed by those just before the nodes where path segments meet."""
         return limit_rows(self.path, self.limits, self.joints, np.concatenate([self.distance, self.before]))
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
@@ -126,7 +126,7 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
-        """Return the grid of the N intervals from a node on, each split into a number of equal parts (N,)."""
+        """Return the grid of N intervals that begin at a node, each split into a given number of equal parts (N,)."""
         last, ends = first + len(parts), np.append(0, np.cumsum(parts))
         s = np.interp(np.arange(ends[-1] + 1), ends, self.distance[first : last + 1])
         own = (self.jumps > first) & (self.jumps <= last)
@@ -209,29 +209,32 @@ def _halve_intervals(
     left, right = np.arange(len(s) - 1), np.arange(1, len(s))
     right[np.searchsorted(s, jumps[0][at]) - 1] = len(s) + np.arange(len(at))
     new, shares = left, (0.5, *GAUSS)
-    for _ in range(SETTINGS.halvings):
-        width, ends = np.diff(s)[new], (rows.take(left[new]), rows.take(right[new]))
-        top = _steady_speeds(*ends, s[new] + width / 2, *requested)
-        # a wave may have equal phases at both ends and in the middle: other places tell
-        places = np.concatenate([s[new] + share * width for share in shares])
-        inside, uneven = limit_rows(path, limits, joints, places), np.zeros(len(new), dtype=bool)
-        for k, share in enumerate(shares):
-            between = inside.take(slice(k * len(new), (k + 1) * len(new)))
-            uneven |= _uneven_intervals((ends[0], between, ends[1]), share, top)
-        uneven &= width > SETTINGS.shortest * path.length
-        if not uneven.any():
+    at_rest = s[0] == 0, s[-1] == path.length
+    for number in range(SETTINGS.halvings + 1):
+        begin, end, width = rows.take(left), rows.take(right), np.diff(s)
+        top = _steady_speeds(begin, end, (s[:-1] + s[1:]) / 2, *requested)
+        rates = acceleration_bounds(begin, end, top**2, top**2)
+        if number == SETTINGS.halvings or not new.size:
             break
+        # a motion that is slow beside an interval is not fast inside it, where limits then need no finer nodes
+        squares = reachable_squares(s, node_minimum(top) ** 2, rates, at_rest)
+        inside = np.sqrt(np.minimum(top**2, (squares[:-1] + squares[1:]) / 2 + rates * width))
+        # a wave may have equal phases at both ends and in the middle: other places tell
+        places = np.concatenate([s[new] + share * width[new] for share in shares])
+        between, uneven = limit_rows(path, limits, joints, places), width[new] < 0
+        for k, share in enumerate(shares):
+            each = begin.take(new), between.take(slice(k * len(new), (k + 1) * len(new))), end.take(new)
+            uneven |= _uneven_intervals(each, share, inside[new])
+        uneven &= width[new] > SETTINGS.shortest * path.length
         cut, middle = new[uneven], np.flatnonzero(uneven)
         s, middle = np.insert(s, cut + 1, places[middle]), len(rows.speed) + middle
         left, right = np.insert(left, cut + 1, middle), np.insert(right, cut, middle)
-        rows = Rows(*(np.concatenate(kinds) for kinds in zip(rows, inside, strict=True)))
+        rows = Rows(*(np.concatenate(kinds) for kinds in zip(rows, between, strict=True)))
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
-    begin, end = rows.take(left), rows.take(right)
-    top = _steady_speeds(begin, end, (s[:-1] + s[1:]) / 2, *requested)
     with np.errstate(divide="ignore"):
         jerk = 1 / np.maximum(np.abs(begin.jerk[:, :, 0]), np.abs(end.jerk[:, :, 0])).max(axis=1, initial=0.0)
     acceleration = 1 / np.maximum(np.abs(begin.acceleration[:, :, 0]), np.abs(end.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, acceleration_bounds(begin, end, top**2, top**2), acceleration, jerk)
+    return _Cells(s[:-1], top, rates, acceleration, jerk)
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
@@ -276,7 +279,7 @@ def _steady_speeds(begin: Rows, end: Rows, inside: Array, bounds: Array, request
 
 
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
-    """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,).
+    """Return which intervals are too long, because a limit varies too nonlinearly with distance in them. Shape (N,).
 
     `places` contains the limits at the beginning, at a fraction of the length, and at the end of each interval. `top`
     are the fastest steady speeds (N,), m/s.
@@ -295,7 +298,7 @@ def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Arr
 
 
 def acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,).
+    """Return upper bounds of the acceleration in each interval, given the squared speeds at both ends. Shape (N,).
 
     `left` and `right` are the limits at both ends of each interval.
     """
@@ -321,13 +324,13 @@ def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple
 
 
 def limit_slope(values: Array, gain: Array) -> Array:
-    """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
+    """Lower values (N,) as little as possible so that neighbours differ by at most as much as those of `gain`."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
 
 
 def node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller of the values of the two intervals that meet at each node. Shape (N + 1,)."""
+    """Return at each node the smaller of the values of the two intervals that meet there. Shape (N + 1,)."""
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 

@@ -210,7 +210,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Check the arguments of `schedule`; return its argument `joints` if joint limits are given, else None.
+    """Check the arguments of `schedule`; return the argument `joints`, or None if no joint limits are given.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -318,7 +318,7 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a path's tangent, curvature vector and derivative of curvature, and the tool's rotation per metre.
+    """Return tangent, curvature vector and derivative of curvature along a path, and the tool's rotation per metre.
 
     Shape (M, 3) each.
     """
@@ -429,7 +429,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of torque limits, which `Rows` lists as the last of its acceleration limits."""
+    """Return the number of torque limits, which are the last acceleration limits in `Rows`."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)

@@ -86,7 +86,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return G distances and speeds on a path's maximum velocity curve, and the G - 1 requested speeds between them."""
+    """Return G distances, the speeds of the maximum velocity curve there, and G - 1 requested speeds between."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -131,7 +131,7 @@ def _refine_distances(
 def _unresolved_intervals(
     length: float, s: Array, permitted: Array, requested: Array, acceleration: float
 ) -> NDArray[np.bool_]:
-    """Return which intervals of a velocity curve are too long where its speed, the permitted speed, limits the motion.
+    """Return which intervals of the maximum velocity curve are too long where the curve limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
@@ -156,7 +156,7 @@ def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower, in place, the speed limits of intervals in which a profile is too fast; return whether any was lowered."""
+    """Lower, in place, the speed limits of intervals where a profile is too fast; return whether any was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -304,7 +304,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return a speed profile within all limits: `line_profile`, planned again where it violates a limit.
+    """Return a speed profile within all limits: that of `line_profile`, planned again where limits are violated.
 
     If it is None, the whole path is planned.
     """
@@ -366,7 +366,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 def _violated_stretches(
     grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float
 ) -> list[tuple[int, int]]:
-    """Return first and last node of each part of a path that must be planned again because a limit is violated there.
+    """Return first and last node of each part of a path that must be planned again, as a limit is violated in it.
 
     They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
     rest.
@@ -394,7 +394,7 @@ def _violated_stretches(
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near both ends of its part of the path, except at path ends."""
+    """Return whether a motion has the requested speed near those of its ends that are not ends of the whole path."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):

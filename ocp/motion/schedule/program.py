@@ -126,7 +126,7 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return matrices from 3 coefficients to squared speed and its 2 derivatives at M points. Shape (3, 3, M)."""
+        """Return matrices (3, 3, M) that map 3 coefficients to squared speed and its 2 derivatives at M points."""
         h, share, ratio = self.h[interval], self.share[interval], self.ratios[interval]
         time = 2 * fraction / (ratio + np.sqrt(ratio**2 + 4 * (1 - ratio) * fraction))  # fraction of the time
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -157,7 +157,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the problem in which only given intervals are free, and the indices of its coefficients."""
+        """Return the problem in which only the given intervals are free, and the indices of the coefficients in it."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -291,7 +291,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of all constraints at given coefficients; linearise the jerk limits there."""
+        """Return violations and scales of all constraints at spline coefficients; linearise the jerk limits there."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -310,30 +310,30 @@ class _Constraints:
 
     def weighted_gradients(self, values: Array) -> Array:
         """Return the sum of the gradients of all constraints, each multiplied by its weight. Shape (N + 2,)."""
-        out = self._spread(self.gradients * values[self.alone :])
+        out = self._accumulate(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
     def outer_products(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return three diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of gradients."""
+        """Return diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of the gradients."""
         g = self.gradients
         pulled = g * values[self.alone :]
-        main = self._spread(g * pulled)
+        main = self._accumulate(g * pulled)
         main[1:-1] += values[: self.count]
         main[self.bounded] += values[self.count : self.alone]
-        return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
+        return main, self._accumulate([g[0] * pulled[1], g[1] * pulled[2]]), self._accumulate([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
         """Return, for each limit constraint, the three spline coefficients of the interval in which it holds."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints, given spline coefficients and the values of the motion limits."""
+        """Stack the values of all constraints: those on single coefficients `b`, then the motion limits' `rows`."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
-    def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values of limits over each interval, and add the k-th sum to the k-th spline coefficient of the interval.
+    def _accumulate(self, values: Iterable[Array]) -> Array:
+        """Sum values of limits by spline coefficient: a limit's k-th value goes to its interval's k-th coefficient.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -371,7 +371,7 @@ def _weighted_sum(weights: Array, values: list[Array]) -> Array:
 
 
 def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
-    """Return the spline coefficients of the fastest motion, found by an interior-point method. Shape (N + 2,).
+    """Return the spline coefficients of the fastest motion, computed by an interior-point method. Shape (N + 2,).
 
     Args:
         program: Program of the stretch.
@@ -472,7 +472,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return relative residuals of constraints with slack variables; 0 for the first `count`, which always hold."""
+    """Return the relative residuals of constraints with slack variables; the first `count` always hold and give 0."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)

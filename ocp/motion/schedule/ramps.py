@@ -116,7 +116,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether a motion in phases of constant jerk ends at the given distance and speed, at permitted speeds."""
+    """Return whether phases of constant jerk end at a given distance and speed, and keep the speed in its range."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -221,7 +221,7 @@ class _Bounds(NamedTuple):
         return cls(np.where(free, 0.0, -q * inverse), middle - reach, middle + reach)
 
     def take(self, places: NDArray[np.intp] | slice) -> _Bounds:
-        """Return the bounds at a subset of the places."""
+        """Return the bounds at selected points of the path."""
         return _Bounds(*(kind[:, places] for kind in self))
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:

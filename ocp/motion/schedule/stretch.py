@@ -169,7 +169,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 
 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
-    """Return into how many parts to split each interval: the fewest with which a motion loses only `lost` of its time.
+    """Return into how many parts to split each interval so that unused jerk costs about the share `lost` of the time.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
     u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
@@ -194,7 +194,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 class _Samples:
-    """Limits at an extensible set of places on a path without jerk limits.
+    """Coefficients of the limits, without jerk limits, at points on a path to which more can be added.
 
     Attributes:
         speed: Largest coefficient of the speed in a limit. Shape (P,), s/m.
@@ -206,7 +206,7 @@ class _Samples:
         self.speed, self.rows = self._columns(grid.rows)
 
     def add(self, places: Array) -> NDArray[np.intp]:
-        """Evaluate the limits at distances (M,) along the path; return the indices of these places."""
+        """Append the coefficients at distances (M,) along the path to the table; return their column indices."""
         grid, first = self.grid, len(self.speed)
         speed, rows = self._columns(limit_rows(grid.path, grid.limits, grid.joints, places))
         self.speed, self.rows = np.append(self.speed, speed), np.concatenate([self.rows, rows], axis=2)
@@ -234,12 +234,13 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
     """
     s, requested, samples = grid.distance, grid.requested, _Samples(grid)
     nodes, before, jumps = np.arange(len(s)), len(s) + np.arange(len(grid.before)), grid.jumps - 1
-    middle, beside = np.empty((2, len(requested)), dtype=np.intp)
+    shares, between = np.array([[GAUSS[0]], [0.5], [GAUSS[1]]]), np.empty((3, len(requested)), dtype=np.intp)
     new, inner = np.full(len(requested), True), np.full(len(s), False)
     for _ in range(SETTINGS.rounds):
         h = np.diff(s)
-        added = samples.add(np.concatenate([s[inner], (s[:-1] + h / 2)[new], (s[:-1] + GAUSS[0] * h)[new]]))
-        nodes[inner], middle[new], beside[new] = np.split(added, np.cumsum([inner.sum(), new.sum()]))
+        places = s[:-1] + shares * h
+        nodes[inner], added = np.split(samples.add(np.append(s[inner], places[:, new])), [inner.sum()])
+        between[:, new] = added.reshape(3, -1)
         right = nodes[1:].copy()
         right[jumps] = before
         slowest = samples.speed[nodes]
@@ -249,7 +250,7 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
         caps[[0, -1]] = 0.0
         x, *rates = reachability_passes(s, caps, samples.rows[:, :, nodes], (jumps, samples.rows[:, :, before]))
         profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
-        used, peak = _usage_without_jerk(profile, samples, (nodes[:-1], beside, middle, right), requested)
+        used, peak = _usage_without_jerk(profile, samples, (places, (nodes[:-1], *between, right)), requested)
         # the excess falls at least as fast as the length of the interval
         parts = np.clip(np.ceil(2 * (peak - 1) / SETTINGS.exceeded) - 1, 1, SETTINGS.parts).astype(np.intp)
         unused = np.where(used[[0, -1]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[2], 0.0)
@@ -261,7 +262,7 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
         number = np.arange(len(at)) - (np.cumsum(parts) - parts)[at]
         s, inner = np.append(s[at] + h[at] * number / parts[at], s[-1]), np.append(number > 0, False)
         nodes, jumps = np.append(nodes[at], nodes[-1]), np.cumsum(parts)[jumps] - 1
-        requested, middle, beside, new = requested[at], middle[at], beside[at], parts[at] > 1
+        requested, between, new = requested[at], between[:, at], parts[at] > 1
     worst = int(peak.argmax())
     place, largest = float(profile.distance[worst]), float(peak[worst])
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
@@ -269,26 +270,26 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 
 
 def _usage_without_jerk(
-    profile: SpeedProfile, samples: _Samples, places: tuple[NDArray[np.intp], ...], requested: Array
+    profile: SpeedProfile, samples: _Samples, places: tuple[Array, tuple[NDArray[np.intp], ...]], requested: Array
 ) -> tuple[Array, Array]:
-    """Return the largest usage of any limit at four places of each interval, (4, N), and anywhere inside it, (N,).
+    """Return the largest ratio to its limit of a quantity except jerk: at five points and over each interval.
 
-    The places are the start, the first Gauss point, the middle and the end. Each row is interpolated by a parabola
-    through the others; its error at the Gauss point, where the error of a cubic is largest, is added.
+    The points are the start, the first Gauss point, the middle, the second Gauss point and the end. `places` are the
+    distances of the inner ones and the indices of all. Each row is interpolated by a parabola through start, middle and
+    end; its error at the Gauss points, where the error of a cubic is largest, is added. Shapes (5, N) and (N,).
     """
-    start, end, h = *(profile.distance[part] for part in (slice(-1), slice(1, None))), np.diff(profile.distance)
-    inside = profile.at_distance(np.concatenate([start + GAUSS[0] * h, start + h / 2]))
+    inside, count = profile.at_distance(places[0].ravel()), len(requested)
     t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
-    first = LineMotion(t, s, v, a, profile.jerk)
-    last = LineMotion(profile.t[1:], end, profile.speed[1:], a + profile.jerk * np.diff(profile.t), profile.jerk)
-    halves = slice(len(h)), slice(len(h), None)
-    motions = first, *(LineMotion(*(kind[part] for kind in inside)) for part in halves), last
-    values = np.stack([samples.usage(motion, at) for motion, at in zip(motions, places, strict=True)])
-    used = np.maximum(np.abs(values).max(axis=1), [motion.speed / requested for motion in motions])
+    first, end = LineMotion(t, s, v, a, profile.jerk), a + profile.jerk * np.diff(profile.t)
+    last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
+    motions = first, *(LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3)), last
+    values = np.stack([samples.usage(motion, at) for motion, at in zip(motions, places[1], strict=True)])
+    sizes, speeds = np.abs(values).max(axis=0), np.array([motion.speed / requested for motion in motions])
+    used, three = np.maximum(np.abs(values).max(axis=1), speeds), values[::2]
     weights = (1 - GAUSS[0]) * (1 - 2 * GAUSS[0]), 4 * GAUSS[0] * (1 - GAUSS[0]), GAUSS[0] * (2 * GAUSS[0] - 1)
-    error = np.abs(weights[0] * values[0] + weights[1] * values[2] + weights[2] * values[3] - values[1])
-    vertex = np.abs(parabola_peak(values[[0, 2, 3]], (0.0, 0.5, 1.0)))
-    return used, np.maximum((vertex + error).max(axis=0), used.max(axis=0))
+    error = np.abs(np.tensordot([weights, weights[::-1]], three, 1) - values[1::2]).max(axis=0)
+    vertex = np.abs(parabola_peak(three, (0.0, 0.5, 1.0)))
+    return used, np.maximum((np.maximum(vertex, sizes) + error).max(axis=0), speeds.max(axis=0))
 
 
 def _solve_with_jerk(
@@ -360,7 +361,7 @@ def _solve_with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a `Program` from the scaled-down solution of a similar one; if that fails, from one scaled down further."""
+    """Solve a `Program` starting from reduced squared speeds of a similar solution; on failure, reduce them further."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -389,7 +390,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest constant jerk that limits permit in the first (side 0) or last interval, next to rest."""
+    """Return the greatest constant jerk permitted from rest in the first interval (side 0), or to rest in the last."""
     interval, sign, ratio = -side, 1.0 - 2.0 * side, 0.0
     for s in (0.0, width):
         for rows in (left, right):
@@ -444,7 +445,7 @@ def _spline_rows(
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return constraints `of` times squared speed <= 1 at given points, each a fraction of an interval."""
+    """Return the constraints c * squared speed <= 1, with coefficients c = `of`, at given fractions of intervals."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, coefficients, np.ones(len(of)), none)
 

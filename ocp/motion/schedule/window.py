@@ -129,7 +129,7 @@ class Window(Stretch):
 
 
 class Margins(NamedTuple):
-    """Fractions of the speed, acceleration and jerk limits that the motion in each interval may use.
+    """Fractions of the speed, acceleration and jerk limits that the motion may use in each interval.
 
     Shape (N,), (N, L) and (N, P).
     """
@@ -143,7 +143,7 @@ class Margins(NamedTuple):
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the usable fractions of the limits, multiplied by one factor for each interval (N,)."""
+        """Return a copy in which the fractions of the limits are multiplied by one factor for each interval (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 
@@ -168,7 +168,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return the limits of a window, none of them enforced yet, with the initial usable fraction of each limit."""
+        """Return the limits of a part of the path (window), none of them enforced yet, with initial margins."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -223,7 +223,7 @@ class EnforcedRows:
         self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce limits at the point of an interval where each is nearest; return which were enforced there before.
+        """Enforce each limit at its point of highest usage in an interval; return which were enforced there before.
 
         Masks of shape (2, N, K + L + P).
         """
@@ -255,7 +255,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
-    """Return the speed profile through squared speeds and their derivatives at the first nodes of a part of a path."""
+    """Return the speed profile from squared speeds, and their slopes by distance, at the first nodes of a path part."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
@@ -263,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
+    """Return each quantity's largest ratio to its limit in given intervals, and its ratios where limits are enforced.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -330,7 +330,7 @@ def limit_usage(
 
 
 def _parabola_errors(rows: list[Array]) -> Array:
-    """Return the largest error of parabolas that interpolate three of five equidistant samples of coefficients.
+    """Return the largest error of parabolas through three of five equidistant samples of coefficients.
 
     Shape (N, L, 3).
     """
@@ -348,7 +348,7 @@ def _inaccurate_rows(bends: Rows, used: Array, motions: tuple[LineMotion, ...]) 
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest fraction used of each limit in B intervals, in both directions, from dense samples.
+    """Return the largest fraction used of each limit in B intervals, in both directions, at closely spaced points.
 
     The jerk changes at the fraction `f` (B,) of each interval. `known` contains the usage at the beginning of each
     interval, before and after that change, and at the end. Shape (4, B, R). The result has shape (2, B, R).
@@ -373,7 +373,7 @@ def _fine_usage(
 
 
 def parabola_peak(values: Array, places: Sequence[Array | float]) -> Array:
-    """Return the extreme value of the parabola through three points if it lies between them, else the first value."""
+    """Return the extreme value of a parabola between the first and last of three points, or the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

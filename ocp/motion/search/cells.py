@@ -23,8 +23,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models import FreeFloating
+from models import FreeFloating, find_wheels
 from models.checks import Array
+from ocp.console import check_time
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -90,7 +91,7 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """States (base and joint positions) that the search reaches at one time.
+    """States of base and joints that the search reaches at one time.
 
     Attributes:
         time: Time, s.
@@ -167,7 +168,7 @@ class CellSearch:
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
             for time in np.linspace(stretch.begin, stretch.end, count + 2)[1:-1].tolist():
-                squared_rate = float(kinematics.speed(base, configurations, time).min())
+                squared_rate = float(kinematics.estimate_squared_rates(base, configurations, time).min())
                 total += squared_rate / 2 * stretch.duration / count
         return total
 
@@ -199,6 +200,8 @@ class _CellPass:
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
+        # the angle of a wheel has no effect
+        self._effective = ~np.isin((robot := request.machine.robot).joint_names, list(find_wheels(robot)))
         self._max_rate, self._cell_size = np.sqrt(2 * max_cost / request.horizon), settings.narrowest
         self._stretch_layers = list[int]()
         self.layers = list[_Layer]()
@@ -222,6 +225,7 @@ class _CellPass:
             shortest = stretch.duration / steps / 2**self._settings.halvings
             task = kinematics.at(layers[-1].base, layers[-1].joints, stretch.begin)
             while remaining:
+                check_time()
                 current = layers[-1]
                 grown, limit_counts = self._expand(kinematics, current, task, remaining[-1], limited=True)
                 if grown is not None:
@@ -256,7 +260,7 @@ class _CellPass:
             rates, violations = limit_rates(rates, task.null[parents], lower, upper, max_rates=max_rates)
             limit_counts.update(map(tuple, violations[violations[:, 0] >= 0].tolist()))
             rates[violations[:, 0] >= 0] = np.nan
-        displacement = np.abs(rates / root).max(axis=1) * step
+        displacement = np.abs(rates / root)[:, self._effective].max(axis=1, initial=0.0) * step
         cost = layer.cost[parents] + step / 2 * (rates**2).sum(axis=1)
         affordable = np.flatnonzero((cost <= self.max_cost) & (displacement <= self._settings.longest))
         if not affordable.size:
@@ -271,7 +275,8 @@ class _CellPass:
             *states, rates, interval=(layer.time, time), tolerance=REACH_TOLERANCE / 10
         )
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
-        finite = np.isfinite(base).all(axis=1) & (np.abs(joints - start_joints).max(axis=1) <= self._settings.longest)
+        displacement = np.abs(joints - start_joints)[:, self._effective].max(axis=1, initial=0.0)
+        finite = np.isfinite(base).all(axis=1) & (displacement <= self._settings.longest)
         expanded = _Layer(time, base, joints, cost, parents)
         expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (error <= REACH_TOLERANCE)))
         expanded = expanded.select(np.flatnonzero(self._valid_states(kinematics, expanded)))
@@ -281,7 +286,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Return the self-motion rates to be tried from each state, in null-space coordinates. Shape (count, C, r)."""
+        """Return self-motion rates to try from each state, as null-space coordinates. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -299,7 +304,7 @@ class _CellPass:
         The cells grow if there are more states than may be kept. Only with `resize`, they also shrink if there are few.
         """
         attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
-        points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
+        points = np.hstack([(joints * self.root)[:, self._effective], attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
         order = np.argsort(cost, kind="stable")
         # without the offset, coordinates of opposite sign would never share a cell
@@ -335,7 +340,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Move states to the poses of the tasks that begin at their time; return the states that reach these poses."""
+        """Move states to the poses of the tasks that begin at this time; return the states that reach them."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -346,7 +351,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return an error which says that no state can be continued, and which joint limit stops most states."""
+        """Return an error that no state can be continued; it names the joint limit that stops most states."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -390,7 +395,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return K motions through given states of L times; `paths` (L, K) holds the indices of the states."""
+        """Return K motions through states at L times; `paths` (L, K) has the index of each state at its time."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -58,7 +58,7 @@ class ChartSettings:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Charts of the self-motion manifolds at given time samples; each chart is a box in a tangent space.
+    """Charts of the self-motion manifolds at given time samples; each chart is a box in the tangent space at a point.
 
     Attributes:
         layer: Index of the time sample. Shape (N,).
@@ -96,11 +96,11 @@ class Charts:
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
     def points(self, places: Array) -> Array:
-        """Return the points (N, n) of the tangent spaces that have given chart coordinates (N, r)."""
+        """Return the points (N, n) of the charts' tangent spaces that have given chart coordinates (N, r)."""
         return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
-        """Fit quadratic forms in chart coordinates to the deviations of the manifold from its charts by least squares.
+        """Fit quadratic forms in chart coordinates, by least squares, to the deviations of the manifold from charts.
 
         Returns:
             The forms, (N, n, r, r), and their residuals at the points of `_rim`, (N, c, n).
@@ -130,7 +130,7 @@ def concatenate(parts: list[Charts]) -> Charts:
 
 
 class SplitCharts(NamedTuple):
-    """Manifold charts of half the radius, which replace the charts that were split.
+    """Charts of half the radius on a self-motion manifold, with the indices of the charts that they replace.
 
     Attributes:
         charts, owners: N charts, and the indices of the charts that they replace, (N,).
@@ -144,7 +144,7 @@ class SplitCharts(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Manifold points at the edges of charts, from which the atlas is extended.
+    """Points of the manifold at the edges of charts, from which the search for further charts continues.
 
     Attributes:
         layer, owners: Indices of the time samples and of the charts. Shape (E,).
@@ -198,7 +198,7 @@ class SelfMotionManifolds:
         return ik_branches(self.equations, self.space.lower, self.space.upper)
 
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
-        """Return configurations that satisfy the task at a time sample, on as many manifold components as possible.
+        """Return configurations that satisfy the task at a time sample, if possible on every component of the manifold.
 
         Shape (K, n), within limits. A solver lists some of every branch. Random starts add others unless all are known.
 
@@ -286,7 +286,7 @@ class SelfMotionManifolds:
         return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
     def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
-        """Return charts with given centres and radii; tangent boxes that extend beyond the joint limits are shrunk."""
+        """Return charts with given centres and radii, whose boxes are shrunk if they exceed the joint limits."""
         deviations = np.nan_to_num(deviations)
         max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
@@ -303,7 +303,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Project boundary points of charts onto the manifold; return projections (nan if failed) and their offsets."""
+        """Project boundary points of charts onto the manifold; return projections (nan if failed) and the offsets."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -404,7 +404,7 @@ class SelfMotionManifolds:
         return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
     def _split_radii(self, charts: Charts, signs: Array) -> Array:
-        """Return the radii that half-size charts need to cover the same part of the manifold as the original charts.
+        """Return the radii that charts in the halves of a split chart need to cover its part of the manifold.
 
         Shape (N c,). Their centres are `signs` (c, r) times the radii. At the centre of a half, let the manifold leave
         the chart with slope Ds. A shift u in the chart is then a shift (1 + Ds' Ds)^1/2 u in the half, whose axes are
@@ -446,7 +446,7 @@ class SelfMotionManifolds:
         return covered
 
     def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Select configurations that lie outside the chart radii of each other, and return their indices."""
+        """Return the indices of configurations, selected so that none lies within the chart radius of another."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
         pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
@@ -462,7 +462,7 @@ class SelfMotionManifolds:
     def _new_charts(
         self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Return new charts, numbered from `first`, at given configurations, and their edge points within limits."""
+        """Return new charts at given configurations, numbered from `first`, and the points at the charts' edges."""
         if like is None:
             chosen = self._thin_out(layer, joints, radii)
             layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]
@@ -482,7 +482,7 @@ class TimeSample(NamedTuple):
 
 
 def _rim(r: int) -> Array:
-    """Return the corners and side midpoints (c, r) of the box [-1, 1]^r, where the deviation of charts is measured."""
+    """Return the corners and side midpoints (c, r) of [-1, 1]^r, at which the deviation of a chart is measured."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
     return np.array([*middles, *corners]).reshape(-1 if r else 0, r)

@@ -170,6 +170,12 @@ class PlanRequest:
         own = IkOptions(base=self.base, limits=self.limits.joints)
         return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
+    @property
+    def redundancy(self) -> int:
+        """Largest number of degrees of freedom that the tasks leave undetermined at any time with an active task."""
+        sizes = [stretch.equations.size for stretch in self.stretches if stretch.equations is not None]
+        return self.machine.joint_size - min(sizes, default=0)
+
     @cached_property
     def bounds(self) -> JointBounds:
         """Position and rate limits of the machine's joints as arrays."""
@@ -241,7 +247,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Return text for an error message about the number of collision-free configurations; [] if it is unknown."""
+    """Return a list with one text about the number of collision-free configurations; empty if it is unknown."""
     if count is None:
         return []
     if isinstance(count, Unreachable):
@@ -296,7 +302,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Shift motions by full turns into the joint limits; track a motion again, within limits, if no shift suffices."""
+    """Shift motions by full turns into the joint limits; track a motion anew within limits if no shift suffices."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -360,7 +366,7 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
-    """Return the error with a time, s, and the positions that the tasks require at this time, added to its message."""
+    """Return an error whose message also states a time, s, and the positions that the tasks require at this time."""
     places = []
     for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
@@ -392,7 +398,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """Inverse kinematics of tasks at successive times; each solve starts from the solutions at the previous time."""
+    """Inverse kinematics of tasks at successive times, each started from the solutions at the time before."""
 
     equations: TaskEquations
     options: dict[str, Any]

@@ -119,12 +119,14 @@ class DeadEnd(SolveError):
         obstructions: Constraints that stop motions there, each kind and name with its least excess, the least first.
         relaxations: Motions that would do the task with a relaxed requirement, the smallest one found of each kind.
         segments: Number of segments in which the task may be done, see `plan`, search="segments"; None if unknown.
+        proven: Whether the search proves, under its assumptions, that no motion exists.
     """
 
     until: float
     obstructions: tuple[Obstruction, ...]
     relaxations: tuple[Relaxation, ...]
     segments: int | None
+    proven: bool
 
     def __init__(
         self,
@@ -134,10 +136,12 @@ class DeadEnd(SolveError):
         relaxations: tuple[Relaxation, ...] = (),
         *,
         segments: int | None = None,
+        proven: bool = False,
         **details: Any,
     ) -> None:
         super().__init__(words, **details)
-        self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
+        self.until, self.obstructions, self.relaxations = until, obstructions, relaxations
+        self.segments, self.proven = segments, proven
 
     def __reduce__(self) -> Any:
         """Return the data from which `pickle` rebuilds the error: its class, arguments and fields."""
@@ -151,8 +155,7 @@ def dead_end(
 
     Args:
         unit: Format of the sample times in the message.
-        proven: Whether the search proves, under its assumptions, that no motion exists.
-        segments: As in `DeadEnd`.
+        proven, segments: As in `DeadEnd`.
     """
     front = _Propagation(search)
     last = front.last
@@ -182,8 +185,9 @@ def dead_end(
         count = "a reconfiguration" if segments == 2 else f"{segments - 1} reconfigurations"
         words += f"; with {count} on the way one may: search='segments'"
     time, until = float(search.times[max(last, 0)]), float(search.times[last + 1])
-    details = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
-    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), segments=segments, **details)
+    details: dict[str, Any] = {"name": smallest.name, "value": smallest.value, "limit": smallest.limit, "time": time}
+    details |= {"segments": segments, "proven": proven}
+    return DeadEnd(words, until, tuple(obstructions), tuple(relaxations), **details)
 
 
 class _Propagation:
@@ -227,7 +231,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Propagate configurations from time sample `k` to the charts of the next, in order of falling clearance."""
+        """Propagate configurations from time sample `k` to charts of sample `k` + 1, in order of falling clearance."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -248,7 +252,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Project configurations to the manifold; keep for each chart the valid configuration of largest clearance."""
+        """Project configurations to the manifold; store for each chart the valid configuration of largest clearance."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -275,7 +279,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return all manifold charts, split until none is wider than the joint step limit or they become too many."""
+    """Return all charts, split until no chart is wider than the joint step limit or there are too many charts."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -337,7 +341,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the starts (M, n) and ends (M, n) of attempted steps from the last reached time sample to the next.
+    """Return starts (M, n) and ends (M, n) of steps tried between the last reached time sample and the next.
 
     The ends are the projection of each start to the next sample, and the configurations at this sample which keep all
     limits but are too far away. Also return which ends satisfy the task (M,).
@@ -363,7 +367,7 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
 
 
 def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
-    """Return an initial guess of a path (K, n): it follows a path to the dead end, and continues on a straight line.
+    """Return an initial guess of a path (K, n): a path to the dead end, continued on a straight line in joint space.
 
     The line leads to the nearest chart centre of the last time sample.
     """
@@ -377,7 +381,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Minimise the error of tip positions, or orientations if `turning`, from a path (K, n); None if that fails."""
+    """From a guess (K, n), find the path of least tip position (if `turning`, orientation) error; None on failure."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()

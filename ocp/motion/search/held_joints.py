@@ -72,7 +72,7 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
 
 
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
-    """Choose collision-free positions for joints held at rest; return the request and start configurations (K, m).
+    """Choose collision-free positions of the joints held at rest; return the request and start configurations (K, m).
 
     Held joints stay where they are if any configuration is collision-free there. Otherwise they take the nearest
     sampled positions with a collision-free configuration. A global search may hold further joints, see
@@ -122,7 +122,7 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
 
 
 def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
-    """Return the positions of the joints that are held at rest only in `request`, not in the user's request `whole`."""
+    """Return the positions of the joints that `request` holds at rest but the user's request `whole` does not."""
     return {name: position for name, position in request.held.items() if name not in whole.held}
 
 
@@ -265,8 +265,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
         request: The request, without idle joints.
         configurations: Its joints at the start. Shape (K, n).
     """
-    sizes = [stretch.equations.size for stretch in request.stretches if stretch.equations is not None]
-    excess = request.machine.joint_size - min(sizes, default=0) - MAX_FREE_DIRECTIONS
+    excess = request.redundancy - MAX_FREE_DIRECTIONS
     columns = _shared_joints(request)[: max(excess, 0)]
     if request.search != "global" or request.machine.base_size or excess <= 0 or len(columns) < excess:
         return request
@@ -298,7 +297,7 @@ def _shared_joints(request: PlanRequest) -> list[int]:
 
 
 def restore_error(error: Error, request: PlanRequest) -> Error:
-    """Return the error after adding the joints held at rest to the configurations that the error contains."""
+    """Return an error in which configurations have been extended by the positions of the joints held at rest."""
     if request.whole is None:
         return error
     robot = request.whole.robot

@@ -81,7 +81,7 @@ class JointSpace:
         return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
 
     def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
-        """Return the coordinates of configurations (M, n) in the nearest-neighbour tree. Shape (M, 1 + n).
+        """Return the coordinates of configurations (M, n) for the nearest-neighbour tree. Shape (M, 1 + n).
 
         The first coordinate separates configurations of different time samples (layers) by MAX_STEP.
         """
@@ -92,7 +92,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations extended by equations that fix some joints; the fixed positions are appended to the targets.
+    """Task equations with additional equations that fix some joints; their positions are appended to the targets.
 
     Attributes:
         fixed: Indices of the fixed joints.
@@ -142,7 +142,7 @@ def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]
 
 
 def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
-    """Return the multiples of 2 pi that, added to the angles `start`, lead closest to `end` within the limits, rad."""
+    """Return the multiples of 2 pi that bring the angles `start` closest to `end` within the limits, rad."""
     least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
     return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
 

@@ -40,7 +40,7 @@ NARROWEST = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Step cost proportional to the length of the step, a norm of the weighted joint displacements.
+    """Step cost that is proportional to the length of the step: a norm of the weighted joint displacements.
 
     By weak duality, any gradient p of the norm, of dual norm at most one, gives the lower bound p . d of the cost of a
     step d. It is linear in the start and in the end of the step, but for the quadratic deviations of the manifolds.
@@ -53,11 +53,11 @@ class Homogeneous(StepCost):
     weights: Array
 
     @abstractmethod
-    def pool(self, values: Array) -> Array:
-        """Sum joint values (n, ..., P) in each term of the norm, which has one joint or, if a maximum, all joints."""
+    def dual_terms(self, values: Array) -> Array:
+        """Return the terms of the dual norm: joint values (n, ..., P) if the cost is a sum, their sum if a maximum."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of the costs of steps and of motions after them, multipliers, and step ends (P, r).
+        """Minimise step plus later cost over the ends of P steps; return lower bounds (P,), multipliers, ends (P, r).
 
         Args: As in `minimal_steps`. The least cost of P steps is that of the linear programs
 
@@ -72,17 +72,17 @@ class Homogeneous(StepCost):
         middle, half = (low + high) / 2, np.maximum((high - low) / 2, NARROWEST)
         place, size = middle.copy(), float(self.weights.max()) * np.maximum(target.radii, NARROWEST)
         value = offset + apply(scaled, place)
-        above = (np.abs(value) if len(self.pool(value)) > 1 else np.abs(value).max(axis=0, keepdims=True)) + size
+        above = (np.abs(value) if len(self.dual_terms(value)) > 1 else np.abs(value).max(axis=0, keepdims=True)) + size
         slacks = [above - value, above + value, place - middle + half, middle + half - place]
-        share = 0.5 / self.pool(np.ones(value.shape))
+        share = 0.5 / self.dual_terms(np.ones(value.shape))
         duals = [np.zeros(value.shape) + share, np.zeros(value.shape) + share, *([size / half / 2] * 2)]
         for _ in range(INTERIOR_STEPS if r else 0):
             gap = sum((slack * dual).sum(axis=0) for slack, dual in zip(slacks, duals, strict=True))
             aim = CENTERING * gap / (2 * len(value) + 2 * r)
             rates = [dual / slack for dual, slack in zip(duals, slacks, strict=True)]
             aims = [aim / slack for slack in slacks]
-            total, lean = self.pool(rates[0] + rates[1]), self.pool((rates[1] - rates[0])[:, None] * scaled)
-            excess = (self.pool(aims[0] + aims[1]) - 1) / total
+            total, lean = self.dual_terms(rates[0] + rates[1]), self.dual_terms((rates[1] - rates[0])[:, None] * scaled)
+            excess = (self.dual_terms(aims[0] + aims[1]) - 1) / total
             square = multiply_transposed(scaled, (rates[0] + rates[1])[:, None] * scaled)
             square -= multiply_transposed(lean, lean / total[:, None])
             square[np.arange(r), np.arange(r)] += rates[2] + rates[3]
@@ -97,7 +97,7 @@ class Homogeneous(StepCost):
             slacks = [part + lengths[0] * change for part, change in zip(slacks, changes, strict=True)]
             duals = [part + lengths[1] * change for part, change in zip(duals, turns, strict=True)]
             place = place + lengths[0] * step
-        multiplier = weights * (duals[0] - duals[1]) / np.maximum(self.pool(duals[0] + duals[1]), 1.0)
+        multiplier = weights * (duals[0] - duals[1]) / np.maximum(self.dual_terms(duals[0] + duals[1]), 1.0)
         remaining = apply_transposed(tangents, multiplier) + slope
         least = np.minimum(remaining * low, remaining * high).sum(axis=0)
         place = np.clip(place, low, high)
@@ -107,7 +107,7 @@ class Homogeneous(StepCost):
         self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
     ) -> Array:
         shares = np.clip(delta / np.maximum(spans, NARROWEST), -1.0, 1.0)
-        multiplier = self.weights * shares / np.maximum(self.pool(np.abs(shares.T)), 1.0).T
+        multiplier = self.weights * shares / np.maximum(self.dual_terms(np.abs(shares.T)), 1.0).T
         start = -np.einsum("pnr,pn->pr", source.tangents, multiplier)
         end = np.einsum("pnr,pn->pr", target.tangents, multiplier) + after.slope
         curve = -np.maximum(-lowest_eigenvalue(after.curve), 0.0)
@@ -137,10 +137,10 @@ class PathLength(Homogeneous):
     """Cost of a step: the weighted sum of the absolute joint displacements."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return the values of `Homogeneous.minimize`; on curves, the bounds are the exact minima.
+        """Return lower bounds (P,) of the costs of steps plus later motion, dual multipliers, and step ends (P, r).
 
-        A minimum lies at an end of the chart or where a joint has no displacement: the slope of the cost, which rises
-        by 2 |w_j T_j| where the displacement of joint j is zero, changes sign there (weighted median).
+        Exact on curves: a minimum lies at an end of the chart or where a joint has no displacement. There the slope of
+        the cost, which rises by 2 |w_j T_j| where joint j has no displacement, changes sign (weighted median).
         """
         if target.low.shape[1] != 1:
             return super().minimize(delta, target, after)
@@ -170,7 +170,7 @@ class PathLength(Homogeneous):
     def reach(self, cost: float, seconds: float) -> float:
         return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
 
-    def pool(self, values: Array) -> Array:
+    def dual_terms(self, values: Array) -> Array:
         return values
 
 
@@ -183,13 +183,13 @@ class LargestMotion(Homogeneous):
     def reach(self, cost: float, seconds: float) -> float:
         return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
 
-    def pool(self, values: Array) -> Array:
+    def dual_terms(self, values: Array) -> Array:
         return np.asarray(values.sum(axis=0, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of the cost of a step, proportional to its length, and of the motion after the step.
+    """Lower bounds of the cost of a step, which is proportional to the step's length, plus the cost of later motion.
 
     On curves, the multipliers of each start are computed anew, since the cost has kinks. On manifolds of more
     dimensions this would take too long.
@@ -231,12 +231,12 @@ class HomogeneousBounds:
         curvature = np.einsum("pab,pb->pa", self.curve, places)
         return value + (places * (slope + curvature / 2)).sum(axis=1), slope + curvature
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
         return places
 
 
 def _longest_step(values: list[Array], changes: list[Array]) -> Array:
-    """Return, for P linear programs, the largest fraction, at most 1, of changes that keeps all values positive."""
+    """Return, for P linear programs, the largest fraction, at most 1, of a change that keeps all values positive."""
     shares = np.zeros(values[0].shape[1])
     for value, change in zip(values, changes, strict=True):
         np.maximum(shares, (-change / value).max(axis=0), out=shares)

@@ -85,7 +85,7 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the lowest-cost chain of adjoining segments; with `bounds`, lower bounds replace known costs.
+        """Return the lowest-cost chain of adjoining segments, by costs or, with `bounds`, by lower bounds of costs.
 
         Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
         """
@@ -105,7 +105,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return the time samples where each of the fewest path segments may start and end; None if no path was found.
+    """Return the samples where each of the fewest segments may start and end; None if no path was found.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -129,7 +129,7 @@ def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> 
 def segment_ends(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False
 ) -> list[int]:
-    """Return the last time sample of each segment if every segment is extended as far as possible.
+    """Return the last time sample of each segment if segments are extended as far as possible one by one.
 
     The list ends with the last sample of all, or with the one from which the motion cannot be continued.
 
@@ -164,7 +164,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the farthest time sample to which a path from `start` leads, or None; `back` searches backwards."""
+    """Return the farthest time sample that a path from `start` reaches, or None; `back` searches backwards in time."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)
@@ -189,7 +189,7 @@ def _last_reachable(
 
 
 def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
-    """Return lower bounds of the costs of segments, by first and last sample; segments without a path may be absent."""
+    """Return lower bounds of segment costs by first and last sample; segments without a path may be missing."""
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
@@ -242,7 +242,7 @@ class SectionSettings:
 def section_values(
     prismatic: bool, lower: float, upper: float, max_step: float, *, settings: SectionSettings = SectionSettings()
 ) -> Array:
-    """Return evenly spaced positions at which sections of a self-motion manifold fix a joint. Shape (V,), rad or m.
+    """Return evenly spaced joint positions at which a self-motion manifold is cut. Shape (V,), rad or m.
 
     Args:
         prismatic: Whether the joint is prismatic.
@@ -262,7 +262,7 @@ class SectionSearch(AtlasSearch):
     def __init__(
         self, *args: Any, joints: tuple[int, ...], values: Array, radius: float, charts: int, **options: Any
     ) -> None:
-        """Build charts of the self-motion manifolds cut at fixed values of joints, at all time samples.
+        """Build charts, at all time samples, of the sections of the self-motion manifolds with given joints fixed.
 
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds`, of one dimension
@@ -276,7 +276,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return for each time sample the charts of the self-motion manifold's curves on which joints are fixed."""
+        """Return, for each time sample, charts of the curves that remain of the manifold if given joints are fixed."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -297,7 +297,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths over all sections and on single sections, sorted by cost, and 0 as their lower cost bound."""
+        """Return paths across sections of the manifolds and within single sections, by rising cost, and the bound 0."""
         count, through_centers = len(self.samples), list[Array]()
         for value in range(len(self._values)):
             restricted = copy(self)

@@ -135,8 +135,8 @@ class ReducedKinematics:
         row_space, null = basis[:, :, : self.rows], basis[:, :, self.rows :]
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
-    def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared norm (K,) of the scaled joint rates that the tasks require far from singularities."""
+    def estimate_squared_rates(self, base: Array, joints: Array, time: float) -> Array:
+        """Estimate the squared norm (K,) of scaled joint rates that perform the tasks; valid far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
@@ -146,7 +146,7 @@ class ReducedKinematics:
         return np.asarray(self.rows * rates_squared / (task.lower**2).sum(axis=(1, 2)))
 
     def velocity_errors(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
-        """Return the norms (K,) of the velocity errors of joint rates (K, n), and of the required tip velocities."""
+        """Return the norms (K,) of the tip velocity errors of joint rates (K, n), and of the required velocities."""
         zeros = np.zeros(len(joints))
         if self.equations is None or self.equations.pose_rows.all():
             return zeros, zeros
@@ -164,7 +164,7 @@ class ReducedKinematics:
         interval: tuple[float, float],
         tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states by one time step of the midpoint rule; scaled joint rates (K, n) prescribe the self-motion.
+        """Advance states by one step of the midpoint rule, where scaled joint rates (K, n) determine the self-motion.
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
@@ -180,7 +180,7 @@ class ReducedKinematics:
             return self.correct_poses(base, joints, end, tolerance)
 
         def remaining(at_end: TaskKinematics, joints: Array) -> Array:
-            """Return, by Simpson's rule, the tip displacement that velocity tasks still require in this step."""
+            """Return the tip displacement that velocity tasks prescribe in this step, less the actual one."""
             straight = (joints - start_joints) * self.root
             parts = ((1, task), (4, middle), (1, at_end))
             return np.asarray(sum(k / 6 * (duration * each.right - each.task_rates(straight)) for k, each in parts))
@@ -197,7 +197,7 @@ class ReducedKinematics:
         max_steps: int = 3,
         remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Correct the pose errors of states by Newton steps; return base, joints and pose errors as `step` does.
+        """Correct the pose errors of states by Newton steps; return base, joints and remaining pose errors.
 
         Args:
             tolerance: Pose error, m and rad, below which the iteration ends.
@@ -356,7 +356,7 @@ def check_floating_reach(
 
 
 def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
-    """Return the pose task that is equivalent to a task at a time; None if the pose depends on the path taken.
+    """Return the pose task with the same effect as a task at a time; None if the pose depends on the path taken.
 
     Args:
         machine, task: The machine and its task.
@@ -381,7 +381,7 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """Return the base configuration for which the centre of mass lies where conserved momentum has moved it.
+    """Return the base configuration that puts the centre of mass where the conserved momentum has moved it.
 
     z holds the joint positions and the attitude of the base.
     """

@@ -250,7 +250,7 @@ class AtlasSearch:
         cost_to_come: list[QuadraticBounds],
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
-        """Return the lowest-cost path through one manifold chart; None if the path breaks off before either end."""
+        """Return the lowest-cost path through one chart; None if it cannot be continued to both ends."""
         slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
         start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
@@ -278,7 +278,7 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Project a chart point, given by coordinates (r,), onto the manifold; return it if it is valid, else None.
+        """Project a point of a chart, with coordinates (r,), onto the manifold; return None if the result is invalid.
 
         A valid configuration is within the joint limits and collision-free. If the result is not valid, points nearer
         to the middle of the chart are tried: a box reaches beyond the limits by the deviation of the manifold.
@@ -322,7 +322,7 @@ class AtlasSearch:
 
     @property
     def gap(self) -> float:
-        """Relative gap between the path's cost and the lower bound at which the search ends."""
+        """Relative gap between the cost of the path and the lower bound at which the search stops."""
         return self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
@@ -386,7 +386,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
-        """Return the cost bound below which charts are halved, as high as memory permits; -inf if halving must end."""
+        """Return the cost bound below which charts are halved, as memory permits; -inf if halving must stop."""
         costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
         if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
             return -np.inf
@@ -396,7 +396,7 @@ class AtlasSearch:
         return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path with steps of cost at most `max_cost`; return the charts that it may pass through, and the path.
+        """Find a path with steps of cost at most `max_cost`; return the charts that the path may use, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -419,7 +419,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Return a path through charts of least cost-to-go bound, shortened; None if it breaks off or is invalid."""
+        """Return a shortened path along charts of least cost-to-go bound; None if it breaks off or is invalid."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
@@ -465,7 +465,7 @@ class AtlasSearch:
         return valid
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
-        """Shorten a path on the manifolds if the result is valid; return None if the path then exceeds step limits."""
+        """Shorten a path on the manifolds unless that makes it invalid; return None if it still exceeds step limits."""
         if path is None:
             return None
         if self.start is None:
@@ -489,7 +489,7 @@ class AtlasSearch:
     def _refine(
         self, charts: Charts, k: int, values: QuadraticBounds, chosen: NDArray[np.bool_]
     ) -> tuple[Charts, QuadraticBounds]:
-        """Halve the chosen charts; return all charts not entirely in collision, and lower cost bounds on them."""
+        """Halve chosen charts; return all charts not entirely in collision, and lower bounds of the cost on them."""
         rows = np.flatnonzero(chosen)
         halves = self._split(charts.select(rows), k)
         free = self._collision_free(halves.charts, k)

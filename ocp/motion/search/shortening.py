@@ -88,7 +88,7 @@ class PathProblem:
     def through_poses(
         cls, machine: FixedBase, poses: PathPoses, cost: Homogeneous, *, bounds: JointBounds, idle: Array, scene: Any
     ) -> PathProblem:
-        """Return the problem of a path through tool poses.
+        """Return the problem of the lowest-cost joint path on which the tool passes through given poses.
 
         Args:
             machine: The arm.
@@ -119,14 +119,14 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Distinct manifolds, each with the indices of its time samples along the path and their row numbers in it."""
+        """Sets of manifolds, each with the indices of its samples along the path and the rows of these in the set."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]
 
     @property
     def weights(self) -> Array:
-        """Weights of the joint displacements in a cost of steps that is proportional to their length. Shape (n,)."""
+        """Weights of joint displacements in the cost of a step, which is proportional to the length. Shape (n,)."""
         assert isinstance(self.steps.cost, Homogeneous)
         return self.steps.cost.weights
 
@@ -144,7 +144,7 @@ class PathProblem:
         return bases
 
     def project(self, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Project configurations (K, s, n), s of each sample, onto the manifolds; also return which converged."""
+        """Project configurations (K, s, n), s at each time sample, onto the manifolds; return a mask of success too."""
         projected, converged = np.empty(joints.shape), np.empty(joints.shape[:2], dtype=bool)
         for manifolds, rows, indices in self._manifolds:
             flat = joints[rows].reshape(-1, joints.shape[2])
@@ -172,7 +172,7 @@ class PathProblem:
         return float(excess)
 
     def distances(self, path: Array, change: Array | None) -> tuple[Indices, Array, Array]:
-        """Return samples of P close pairs of bodies, their distances beyond the clearance, m, and distance gradients.
+        """Return sample indices of P close body pairs, distances beyond the clearance, m, and gradients of distance.
 
         Bodies are close if joint displacements `change` (K, n) may bring them below the clearance; None: if they are
         below it, without gradients. Shapes (P,), (P,), (P, n).
@@ -304,7 +304,7 @@ PROGRAM = ProgramSettings()
 
 
 class _Rows(NamedTuple):
-    """Functions of a path of K configurations, linearised in the joint positions: gradients and values at the path.
+    """Gradients and values of functions of a path of K configurations that are linearised in the joint positions.
 
     Attributes:
         gradient: Sparse matrix. Shape (R, K n).
@@ -355,14 +355,14 @@ class _LocalProgram:
         if solved:
             self.displacement = (self._basis @ self._solution.x[:size]).reshape(path.shape)
 
-    def _steps(self, k: Indices, joint: Indices, factor: Array) -> Any:
-        """Return the gradients of `factor` times the displacements of joints from samples `k` to the next."""
+    def _step_gradients(self, k: Indices, joint: Indices, factor: Array) -> Any:
+        """Return gradients, with respect to the path, of `factor` times displacements of `joint` after samples `k`."""
         n, rows = self._path.shape[1], np.arange(len(k))
         entries = np.append(factor, -factor), (np.tile(rows, 2), np.append((k + 1) * n, k * n) + np.tile(joint, 2))
         return scipy.sparse.csr_array(entries, shape=(len(k), self._path.size))
 
     def _cost_rows(self) -> tuple[_Rows, Indices]:
-        """Return linear functions and group numbers: the groups' maxima add up to the cost in the trust region."""
+        """Return linear functions and group numbers; in the trust region the cost is the sum of group maxima."""
         delta, by_joint = np.diff(self._path, axis=0), isinstance(self._problem.steps.cost, PathLength)
         k, joint, sign = (index.ravel() for index in np.indices((*delta.shape, 2)))
         factor, reach = (2.0 * sign - 1.0) * self._problem.weights[joint], self._size[1:] + self._size[:-1]
@@ -371,10 +371,10 @@ class _LocalProgram:
         least = np.full(delta.size, -np.inf)
         np.maximum.at(least, groups, value - change)
         chosen = np.flatnonzero((value + change >= least[groups]) & (factor != 0))
-        return _Rows(self._steps(k[chosen], joint[chosen], factor[chosen]), value[chosen]), groups[chosen]
+        return _Rows(self._step_gradients(k[chosen], joint[chosen], factor[chosen]), value[chosen]), groups[chosen]
 
     def _limit_rows(self) -> _Rows:
-        """Return constraints <= 0 for joint limits, step limits and clearances that a displacement may violate."""
+        """Return linear constraints <= 0 for the joint limits, step limits and clearances that may be violated."""
         problem, path, n = self._problem, self._path, self._path.shape[1]
         gradients, values, reach = list[Any](), list[Array](), self._size[1:] + self._size[:-1]
         for sign, limit in ((1.0, problem.upper), (-1.0, -problem.lower)):
@@ -385,7 +385,7 @@ class _LocalProgram:
             values.append(excess.ravel()[rows])
             excess = sign * np.diff(path, axis=0) - problem.steps.limits
             k, joint = np.nonzero(excess > -reach)
-            gradients.append(self._steps(k, joint, np.full(len(k), sign)))
+            gradients.append(self._step_gradients(k, joint, np.full(len(k), sign)))
             values.append(excess[k, joint])
         at, distance, gradient = problem.distances(path, self._size)
         entries = -gradient.ravel(), (np.repeat(np.arange(len(at)), n), (at[:, None] * n + np.arange(n)).ravel())
@@ -394,7 +394,7 @@ class _LocalProgram:
         return _Rows(scipy.sparse.vstack(gradients).tocsr(), np.concatenate([*values, -distance]))
 
     def decreases_to_second_order(self) -> bool:
-        """Return whether the cost may decrease to second order on displacements that keep all active constraints."""
+        """Return whether displacements that keep all active constraints may decrease the cost to second order."""
         if self._solution.status != 0:
             return True
         samples, n, r = self._tangents.shape

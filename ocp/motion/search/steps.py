@@ -58,7 +58,7 @@ class QuadraticBounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Joint displacement limits, times and cost of the steps between consecutive time samples.
+    """Steps between consecutive time samples: limits of the joint displacements, times, and the cost of a step.
 
     Attributes:
         times: Times of the samples, s. Shape (K,).
@@ -90,14 +90,14 @@ class CurvedCharts(NamedTuple):
 
 
 class StepBounds(Protocol):
-    """Lower bounds of the cost-to-go through P steps, the steps included, as functions of where on a chart they start.
+    """Lower bounds of the cost of P steps plus the motion after them, as functions of the starts in chart coordinates.
 
     At each point p, the quadratic function with the bound's value and slope at p, and `curve`, is a lower bound too.
     """
 
     @property
     def curve(self) -> Array:
-        """Symmetric matrices of the quadratic terms. Shape (P, r, r)."""
+        """Symmetric matrices of the quadratic terms of the lower bounds. Shape (P, r, r)."""
 
     def select(self, rows: Any) -> Self:
         """Return the lower bounds of the cost-to-go through the steps with the given indices."""
@@ -105,10 +105,10 @@ class StepBounds(Protocol):
     def at(self, places: Array) -> tuple[Array, Array]:
         """Return values (P,) and gradients (P, r) of the cost bounds for steps that start at chart points (P, r)."""
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates t at which bound(t) - slope . t - t . curve . t / 2 is no larger than at `places`.
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
+        """Return chart points, by descent from `places`, where the cost bound minus a quadratic function is no higher.
 
-        All arguments have one entry for each step.
+        The function is slope . t + t . curve . t / 2. All arguments have one entry for each step.
         """
 
 
@@ -119,7 +119,7 @@ class StepCost(ABC):
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return the costs (P,) and end coordinates (P, r) of the lowest-cost step into each of P manifold charts.
+        """Return costs (P,) and end coordinates (P, r) of the lowest-cost steps into each of P manifold charts.
 
         The centres of the charts are `delta` (P, n) away. The costs include the remaining costs `after`.
         """
@@ -128,7 +128,7 @@ class StepCost(ABC):
     def lower_bounds(
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
-        """Return lower bounds of the costs of P steps between manifold charts, plus the costs `after` the steps.
+        """Return lower bounds on the cost of P steps between manifold charts plus the cost `after` the steps.
 
         The centres of the charts are `delta` (P, n) apart.
         """
@@ -136,9 +136,9 @@ class StepCost(ABC):
     def quick_bounds(
         self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
     ) -> Array:
-        """Return quickly computed constants (P,) that are lower bounds of `lower_bounds` in the source charts.
+        """Return constant lower bounds (P,) of the cost of P steps that start in source charts, plus the cost `after`.
 
-        The displacements of the joints differ from `delta` by at most `spans` (P, n).
+        Weaker but quicker than `lower_bounds`. The joint displacements differ from `delta` by at most `spans` (P, n).
         """
         return np.full(len(delta), -np.inf)
 
@@ -148,7 +148,7 @@ class StepCost(ABC):
 
     @abstractmethod
     def reach(self, cost: float, seconds: float) -> float:
-        """Return the greatest length, in the metric of the charts, of a step whose cost is at most `cost`."""
+        """Return the greatest length, in the metric of the charts, of steps that cost at most `cost`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ class SquaredRates(StepCost):
 
 
 def rows_last(rows: Array) -> Array:
-    """Move the first axis (the steps) to the end, which vectorises sums over joints over all steps."""
+    """Move the first axis, which counts the steps, to the end, so that sums over joints are fast for all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
@@ -244,7 +244,7 @@ def dot(left: Array, right: Array) -> Array:
 
 
 def _support(points: Array, direction: Array) -> Array:
-    """Return the largest component, but at least 0, of each point set (c, n, P) along directions (n, P). Shape (P,)."""
+    """Return the support function, at least 0, of point sets (c, n, P) in directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
         np.maximum(support, dot(point, direction), out=support)
@@ -252,7 +252,7 @@ def _support(points: Array, direction: Array) -> Array:
 
 
 def _symmetric_support(points: Array, directions: Array) -> Array:
-    """Return the largest absolute component of each point set (c, n, P) along directions (n, r, P). Shape (r, P)."""
+    """Return the largest absolute dot product of points (c, n, P) with each direction (n, r, P). Shape (r, P)."""
     support = np.zeros(directions.shape[1:])
     for point in points:
         np.maximum(support, np.abs(apply_transposed(directions, point)), out=support)
@@ -271,7 +271,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of a step and of the motion after it, as functions of where on a chart the step starts.
+    """Lower bounds of the cost of a step plus the motion after it, as functions of the start in chart coordinates.
 
     The cost is the integral of the squared joint rates; places are coordinates in the chart.
 
@@ -307,7 +307,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the bounds over the ends of steps; return steps to the chart centres, minima and minimisers."""
+        """Minimise the cost bounds over end points in the charts; return steps to chart centres, minima, minimisers."""
         start = self.projection - apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
@@ -319,7 +319,7 @@ class SquaredRateBounds:
         slope = products + self.slope - apply_transposed(self.rotation, start + end_place) / self.seconds
         return value + dot(places, products / 2 + self.slope), rows_first(slope)
 
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+    def descend(self, places: Array, slope: Array, curve: Array) -> Array:
         if places.shape[1] > 2:
             return places
         end_place = self._minimize_after(rows_last(places))[2]
@@ -329,7 +329,7 @@ class SquaredRateBounds:
 
 
 def rows_first(columns: Array) -> Array:
-    """Move the last axis (the steps) to the front, which is the inverse of `rows_last`."""
+    """Move the last axis, which counts the steps, to the front; the inverse of `rows_last`."""
     return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
@@ -344,7 +344,7 @@ def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Minimise P quadratic functions over boxes; unlike in `least_in_box`, the last array axis counts the functions."""
+    """Return the minima and minimisers of P quadratic functions over boxes; the last axis counts the functions."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
@@ -380,7 +380,7 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
 
 
 def _separate(square: Array) -> Array:
-    """Return diagonal lower bounds (r, r, P) of symmetric matrices by Gershgorin's theorem; unchanged if r < 3.
+    """Return lower bounds of symmetric matrices (r, r, P): diagonal ones by Gershgorin's theorem, themselves if r < 3.
 
     Each mixed term is at least minus the mean of both squares.
     """
@@ -402,7 +402,7 @@ def lowest_eigenvalue(square: Array) -> Array:
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
-    """Raise the eigenvalues of symmetric matrices (r, r, P) to at least `floor`; also return the largest increases."""
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to `floor` or more; also return the largest increases."""
     excess = np.maximum(floor - lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models import FixedBase, Sphere
+from models import FixedBase, Machine, Sphere
 from models.checks import Array
 from models.shapes.bodies import RigidParts, lever_arms
 from ocp.console import TimeLimitReached
@@ -34,8 +34,10 @@ from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings
 from ocp.motion.search.shortening import PathPoses, PathProblem
 from ocp.motion.search.steps import SquaredRates, StepCost, Steps
-from ocp.motion.tasks.equations import TaskEquations
+from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds
+from ocp.motion.tasks.targets import targets_along
+from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.tolerances import ROUNDING_SHARE
 
 
@@ -94,6 +96,7 @@ class TaskSearch:
         """
         self.request, self._settings = request, settings
         machine, bounds = request.machine, request.bounds
+        require_poses(request)
         if machine.base_size:
             words = "search='global' needs a machine on a fixed base; use search='configurations'"
             raise ProblemError(words, name="search", value="global")
@@ -112,16 +115,13 @@ class TaskSearch:
         for stretch, motion in zip(request.stretches, motions, strict=True):
             if (equations := stretch.equations) is None:
                 continue
-            if not equations.pose_rows.all():
-                words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
-                raise ProblemError(words, name="search", value="global", time=stretch.begin)
             free_directions = machine.joint_size - equations.size
             if free_directions > MAX_FREE_DIRECTIONS:
                 held = f" ({', '.join(request.held)} are held)" if request.held else ""
                 words = (
                     f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined: "
                     f"they prescribe {equations.size} rows, and {machine.joint_size} joints move: "
-                    f"{', '.join(machine.robot.joint_names)}{held}; search='global' supports at most "
+                    f"{', '.join(machine.robot.joint_names)}{held}; search='segments' supports at most "
                     f"{MAX_FREE_DIRECTIONS}. Lock a joint with lock_joints(robot, {{NAME: POSITION}}), add rows or a "
                     "task, or use search='configurations'"
                 )
@@ -207,7 +207,7 @@ class TaskSearch:
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
-        """Mask of the steps between time samples that are long enough to be subdivided."""
+        """Mask of the intervals between time samples that are long enough to be subdivided."""
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
@@ -216,15 +216,15 @@ class TaskSearch:
 
     @property
     def near_cost(self) -> float:
-        """Cost up to which a motion counts as close to the bound: twice the gap at which the search ends."""
+        """Cost below which a motion is close to the bound: its relative gap is twice that which ends the search."""
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
-        """Return cost bound, time and configuration of each class of motions below a `cost` without a known path."""
+        """Return cost bound, time and joints of the classes of motions with bounds below `cost` but no known path."""
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
-        """Add time samples where the best path is near a limit, or `everywhere`, and search again.
+        """Add time samples where the best path is near a limit (or `everywhere`), and search again.
 
         Returns:
             Whether any were added.
@@ -277,10 +277,18 @@ class TaskSearch:
         return motions
 
 
+def require_poses(request: PlanRequest) -> None:
+    """Raise ProblemError if a task of a request for a global search prescribes a velocity instead of a pose."""
+    for stretch in request.stretches:
+        if stretch.equations is not None and not stretch.equations.pose_rows.all():
+            words = "search='global' needs poses, but a task gives velocities; give the tip's position=..."
+            raise ProblemError(words, name="search", value="global", time=stretch.begin)
+
+
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose few times of a motion so that straight steps between them cost at most the fraction `share` less than it.
+    """Choose few times of a motion, such that straight steps between them cost nearly as much as the motion.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.
@@ -358,47 +366,126 @@ def lower_bound_along(
 def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, bounds: JointBounds) -> float:
     """Return a lower bound of the cost of all joint paths through tool poses, for any number of redundant joints.
 
-    It follows from the motion of the tool alone. A step with joint displacements d moves a point of the tool by at most
-    lever . |d|, and rotates the tool by at most turn . |d|. The least cost of a step is thus at least that of a linear
-    program with one row for each of two points and one for the rotation. Each feasible point of the dual program,
+    It follows from the motion of the tool alone, see `_ToolLevers`. The least cost of a step is at least that of a
+    linear program. Each feasible point of the dual program,
 
         maximise  distances . y,   y >= 0,   dual norm of (levers' y) <= 1,
 
-    gives a lower bound for all steps. Its vertices are enumerated. The points are the tip and, at a wrist, the point of
-    the last axis nearest to the axis before, of which fewer joints move.
+    gives a lower bound for all steps. Its vertices are enumerated.
     """
-    robot, parts = machine.robot, RigidParts.of(machine.robot)
-    chain = parts.path(parts.of_link[robot.root], parts.of_link[robot.tip_link])[1]
-    rotation, translation = parts.pose[robot.tip_link]
-    tip, axes = translation + rotation @ robot.tip_translation, rotation @ robot.tip_rotation
-    points = [tip]
-    if len(chain) > 1:
-        last, before, offset = chain[-1], np.asarray(chain[-2].joint.axis), np.asarray(chain[-1].translation)
-        along = last.rotation @ last.joint.axis
-        slope = max(1 - (along @ before) ** 2, ROUNDING_SHARE)
-        points.append(((offset @ before) * (along @ before) - offset @ along) / slope * last.joint.axis)
-    levers = np.zeros((len(points) + 1, robot.dof))
-    down = [(step, True) for step in chain]
-    ends = [Sphere(TOLERANCE, point) for point in points]
-    arms = [lever_arms(robot, down, end, low=bounds.lower, high=bounds.upper)[0] for end in ends]
-    for (joint, *_), *reach in zip(chain, *arms, strict=True):
-        column, ratio, _ = robot.couplings[joint.name]
-        turn = 0.0 if joint.kind == "prismatic" else 1.0
-        levers[:, column] += abs(ratio) * np.array([*(arm if turn else 1.0 for arm in reach), turn])
-    places = [poses.positions + poses.rotations @ (axes.T @ (point - tip)) for point in points]
-    attitudes = scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
-    turns = attitudes[:-1].inv() * attitudes[1:]
-    lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places]
+    tool = _ToolLevers.of(machine, bounds)
     with np.errstate(divide="ignore", invalid="ignore"):
-        rates = np.where(levers > 0, levers / cost.weights, 0.0)
+        rates = np.where(tool.levers > 0, tool.levers / cost.weights, 0.0)
     rows = np.flatnonzero(np.isfinite(rates).all(axis=1))  # a joint that costs nothing takes the tool along
     if not rows.size:
         return 0.0
-    limits, count = cost.pool(rates[rows].T), len(rows)
+    limits, count = cost.dual_terms(rates[rows].T), len(rows)
     planes, right = np.vstack([limits, np.eye(count)]), np.append(np.ones(len(limits)), np.zeros(count))
     corners = np.array([*combinations(range(len(planes)), count)])
     corners = corners[np.abs(np.linalg.det(planes[corners])) > 0]
     vertices = np.maximum(np.linalg.solve(planes[corners], right[corners][:, :, None])[:, :, 0], 0.0)
     vertices /= np.maximum((vertices @ limits.T).max(axis=1, keepdims=True), 1.0)  # others are moved into the polytope
-    distances = np.stack([*lengths, turns.magnitude()], axis=1)[:, rows]
+    distances = tool.distances(poses.positions, poses.rotations)[:, rows]
     return float((distances @ vertices.T).max(axis=1).sum())
+
+
+def tool_rate_bound(request: PlanRequest) -> float:
+    """Return a lower bound of the cost of all motions that do pose tasks, for any number of redundant joints.
+
+    The cost is the integral of half the weighted squared joint rates. In a time step h, joints that move by d cost at
+    least the sum of w_j d_j^2 / (2 h). With the rows of `_ToolLevers` for each task whose targets are given in world,
+    the least cost of the step is at least that of a quadratic program, and thus, for any y >= 0, at least
+
+        (distances . y)^2 / (2 h y' G y),   G = levers W^-1 levers'.
+
+    The best y is found by nonnegative least squares (Lawson, Hanson 1974, section 23.4).
+    """
+    machine, weights, bound = request.machine, request.weights, 0.0
+    for stretch in request.stretches:
+        count = max(int(np.ceil(request.settings.local_steps * stretch.duration / request.horizon)), 1)
+        times = np.union1d(np.linspace(stretch.begin, stretch.end, count + 1), stretch.nodes)
+        levers, distances = [np.zeros((0, machine.joint_size))], [np.zeros((len(times) - 1, 0))]
+        for task in (request.tasks[i] for i in stretch.tasks):
+            if task.is_pose and task.relative_to is None and task.start_gap <= TipTask.start_gap:
+                tool = _ToolLevers.of(bind(machine, task).bound[0].tip, request.bounds)
+                levers.append(tool.levers)
+                distances.append(tool.task_distances(task, times - task.begin))
+        factor, right = np.vstack(levers) / np.sqrt(weights), np.hstack(distances)
+        for row, step in zip(right, np.diff(times), strict=True) if len(factor) else ():
+            target = row / max(row.max(initial=0.0), TOLERANCE)
+            dual = scipy.optimize.nnls(np.vstack([factor.T, target]), np.append(np.zeros(len(weights)), 1.0))[0]
+            spread = float(((factor.T @ dual) ** 2).sum())
+            bound += float(row @ dual) ** 2 / (2 * step * spread) if spread > 0 else 0.0
+    return bound
+
+
+def _angles(rotations: Array) -> Array:
+    """Return the angles (M - 1,) between successive rotation matrices (M, 3, 3), rad."""
+    attitudes = scipy.spatial.transform.Rotation.from_matrix(rotations)
+    return np.asarray((attitudes[:-1].inv() * attitudes[1:]).magnitude())
+
+
+@dataclass(frozen=True, eq=False)
+class _ToolLevers:
+    """Upper bounds of the motion of a tool: joint displacements d move its points and turn it by at most levers . |d|.
+
+    The points are the tip and, at a wrist, the point of the last axis nearest to the axis before, of which fewer joints
+    move. The last row is the rotation.
+
+    Attributes:
+        machine: The machine whose tip is the tool, on a fixed base.
+        points: Points of the tool, relative to the tip, along the axes of the tip. Shape (P, 3), m.
+        levers: Largest distances of the points from the axes of the joints, 1 for a prismatic joint; in the last row 1
+            for a revolute joint and 0 for a prismatic one. Shape (P + 1, n).
+    """
+
+    machine: Machine
+    points: Array
+    levers: Array
+
+    @classmethod
+    def of(cls, machine: Machine, bounds: JointBounds) -> _ToolLevers:
+        """Return each joint's largest lever arms on a machine's tool over all configurations within joint limits."""
+        robot, parts = machine.robot, RigidParts.of(machine.robot)
+        chain = parts.path(parts.of_link[robot.root], parts.of_link[robot.tip_link])[1]
+        rotation, translation = parts.pose[robot.tip_link]
+        tip, axes = translation + rotation @ robot.tip_translation, rotation @ robot.tip_rotation
+        points = [tip]
+        if len(chain) > 1:
+            last, before, offset = chain[-1], np.asarray(chain[-2].joint.axis), np.asarray(chain[-1].translation)
+            along = last.rotation @ last.joint.axis
+            slope = max(1 - (along @ before) ** 2, ROUNDING_SHARE)
+            points.append(((offset @ before) * (along @ before) - offset @ along) / slope * last.joint.axis)
+        levers = np.zeros((len(points) + 1, robot.dof))
+        down = [(step, True) for step in chain]
+        ends = [Sphere(TOLERANCE, point) for point in points]
+        arms = [lever_arms(robot, down, end, low=bounds.lower, high=bounds.upper)[0] for end in ends]
+        for (joint, *_), *reach in zip(chain, *arms, strict=True):
+            column, ratio, _ = robot.couplings[joint.name]
+            turn = 0.0 if joint.kind == "prismatic" else 1.0
+            levers[:, column] += abs(ratio) * np.array([*(arm if turn else 1.0 for arm in reach), turn])
+        return cls(machine, (np.array(points) - tip) @ axes, levers)
+
+    def distances(self, positions: Array, rotations: Array) -> Array:
+        """Return distances of the points, m, and angles, rad, between successive poses (M, 3), (M, 3, 3) of the tip."""
+        places = [positions + rotations @ point for point in self.points]
+        return np.column_stack(
+            [*(np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places), _angles(rotations)]
+        )
+
+    def task_distances(self, task: TipTask, times: Array) -> Array:
+        """Return how far a task moves and turns the tool between successive times (M,) since its start; 0 if free."""
+        still = {"base": np.zeros((len(times), 0)), "joints": np.zeros((len(times), self.machine.joint_size))}
+        (target,) = targets_along(self.machine, [replace(task, begin=0.0, duration=None)], times, **still)
+        placed, turned = len(task.linear) == 3, set(ANGULAR) <= set(task.chosen)
+        if placed and turned:
+            return self.distances(target.position, target.rotation)
+        distances = np.zeros((len(times) - 1, len(self.levers)))
+        if placed or task.along_reference:
+            distances[:, 0] = np.linalg.norm(np.diff(target.position[:, task.linear], axis=0), axis=1)
+        if turned:
+            distances[:, -1] = _angles(target.rotation)
+        elif task.tilts:
+            chords = np.linalg.norm(np.diff(target.rotation[:, :, 2], axis=0), axis=1)
+            distances[:, -1] = 2 * np.arcsin(np.minimum(chords / 2, 1.0))
+        return distances

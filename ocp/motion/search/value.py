@@ -168,7 +168,7 @@ class ChartGraph:
     def _sweep(
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
     ) -> list[QuadraticBounds]:
-        """Propagate lower bounds of the cost from time sample to time sample in the given order."""
+        """Propagate lower bounds of the cost through time samples in a given order; return those at each sample."""
         layers = self.layers
         bounds: list[Any] = [None] * len(layers)
         first = order[0]
@@ -185,7 +185,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return lower cost bounds on charts of time sample `k`, from the bounds `after` on those of an adjacent one.
+        """Return lower cost bounds on the charts of time sample `k`, from the bounds `after` at an adjacent sample.
 
         With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """
@@ -237,7 +237,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace a cost bound by the constant `floor` if that exceeds the mean of its minimum and middle value."""
+        """Replace chart bounds by the constant `floor` where it exceeds the mean of their minimum and central value."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -257,14 +257,14 @@ class ChartGraph:
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return, for each step, a lower bound of the cost of any complete motion that contains the step. Shape (P,)."""
+    """Return for each step a lower bound of the cost of any complete motion that contains this step. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]
 
 
 def _least_of_groups(values: Array, groups: Indices) -> Array:
-    """Return for each value the least value with the same group number; equal numbers are consecutive. Shape (P,)."""
+    """Return for each value the least value of its group; groups are consecutive. Shape (P,)."""
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
@@ -304,7 +304,7 @@ def _bound_charts(
         remaining, boxes, curvature = steps.select(rows), charts.select(rows), common[rows]
         place = best.minimum(boxes.low, boxes.high)[1]
         for _ in range(settings.refinements):
-            place = remaining.lower(place, tilt[rows], curvature)
+            place = remaining.descend(place, tilt[rows], curvature)
         tangent = _tangent_bounds(place, remaining.at(place), curves[rows], curvature, tilt[rows])
         best, least[rows] = _best_combination(best, least[rows], tangent, boxes)
     least = np.minimum.reduceat(least, starts)
@@ -345,7 +345,7 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return lower bounds of costs minus a common quadratic function, from the tangents of the costs at given points.
+    """Return quadratic lower bounds that touch the cost bounds at given points, minus a common quadratic function.
 
     The subtracted function is tilt . t + t . common . t / 2.
     """

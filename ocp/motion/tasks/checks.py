@@ -104,7 +104,7 @@ def checked_tasks(
         check_start: Whether the pose at the start is checked.
     """
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
-    rows = _rows_by_name(equations)
+    rows = _equation_numbers(equations)
     jacobian = equations.jacobian(b, q)
     if equations.size > len(joints):
         words = f"the task fixes {equations.size} rows {rows} but the machine has only {len(joints)} joints"
@@ -147,15 +147,15 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a text that names the task equations if they are linearly dependent in a configuration, else None."""
+    """Return a text about the task equations if these are linearly dependent in a configuration, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
-    return f"the task of rows {_rows_by_name(equations)}" if values[-1] <= 1e-12 * values[0] else None
+    return f"the task of rows {_equation_numbers(equations)}" if values[-1] <= 1e-12 * values[0] else None
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints' positions affect neither the required joint rates nor the base motion. Shape (n,).
+    """Return a mask of joints whose positions affect neither the required joint rates nor the base. Shape (n,).
 
     That is evaluated in random configurations: the rates that do the tasks, the null space, the base motion and the
     cones of tool axes do not depend on such a joint position.
@@ -181,8 +181,8 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
     return ignorable
 
 
-def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the numbers by which messages name the task equations: twist components 0..5 of one task, else indices."""
+def _equation_numbers(equations: TaskEquations) -> list[int]:
+    """Return the numbers of the task equations in messages: a single task's twist components 0 to 5, or row indices."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -217,7 +217,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if a task's target pose, or its target velocity's integral, does not return to its start."""
+    """Raise ProblemError if a task's target pose, or the integral of its target velocity, does not end as it begins."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in equations.by_task(values):
         task = part.task
@@ -257,7 +257,7 @@ def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
 
 
 def _moving_tasks(equations: TaskEquations, time: float) -> Iterator[tuple[BoundTask, Array]]:
-    """Yield the tasks that prescribe motion at a time, and the velocities that they prescribe, m/s and rad/s."""
+    """Yield the tasks that prescribe motion at a time, with the prescribed velocities, m/s and rad/s."""
     for part, values in equations.by_task(np.array(equations.target_function()(time)).ravel()):
         velocity = values[part.rate_rows] if part.task.is_pose else values
         if np.linalg.norm(velocity) > CHECKS.still:
@@ -309,7 +309,7 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
-    """Return upper bounds of the tip's speed, m/s, and angular speed, rad/s, under given joint rate limits (n,)."""
+    """Return upper bounds of the tip's speed, m/s, and angular speed, rad/s, for given joint rate limits (n,)."""
     linear, angular = 0.0, 0.0
     whole = machine.robot.path_to(machine.robot.tip_link)
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
@@ -354,7 +354,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation by sampled angular velocities (3, samples) in world (Magnus expansion)."""
+    """Return the angle, rad, of the rotation that results from sampled angular velocities (3, samples) in world."""
     first, middle, last = velocity[:, :-2:2], velocity[:, 1:-1:2], velocity[:, 2::2]
     vectors = step / 3 * (first + 4 * middle + last) + step**2 / 3 * np.cross(last, first, axis=0)
     turns = scipy.spatial.transform.Rotation.from_rotvec(vectors.T)
@@ -362,7 +362,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for joints that tasks bring to rest.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for joints that the tasks stop.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
     joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task

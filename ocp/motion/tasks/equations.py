@@ -22,13 +22,13 @@ from models.machines.machine import with_tip
 from models.robot.kinematics import manipulability_of
 from models.spatial import on_scalars, rotation_from_quaternion
 from ocp.errors import ProblemError, problem_errors, require
-from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, closing_combinations, cross_product
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, base_independent_combinations, cross_product
 from ocp.motion.tasks.tracks import on_symbols, track_expression
 
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:
-    """Stacked equations of all tip tasks of a machine, created by `bind`.
+    """Equations of all tip tasks of a machine, stacked in one system; `bind` creates them.
 
     Attributes:
         machine: The machine.
@@ -45,11 +45,11 @@ class TaskEquations:
 
     @property
     def target_size(self) -> int:
-        """Number of values in the column of targets of all tasks."""
+        """Number of target values of all tasks, stacked in one column."""
         return sum(part.target_size for part in self.bound)
 
     def by_row(self, value_of: Callable[[TipTask], Any]) -> Array:
-        """Return a value of each task, repeated for each of its equations. Shape (size, ...)."""
+        """Return for each task equation a value of the task to which the equation belongs. Shape (size, ...)."""
         return np.repeat([value_of(part.task) for part in self.bound], [part.task.size for part in self.bound], axis=0)
 
     @property
@@ -59,7 +59,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask (n,) of joints that move no task or reference frame; all False if joints may move or tip the base."""
+        """Mask (n,) of joints that move no task frame or reference frame; all False unless the base is fixed."""
         couplings = self.machine.robot.couplings
         fixed_base = isinstance(self.machine, FixedBase) and not isinstance(self.machine, Standing)
         idle = np.full(self.machine.joint_size, fixed_base)
@@ -68,7 +68,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task equations as text, with the given suffixes for pose and velocity tasks."""
+        """Return the units of the task equations as a text, with given suffixes for pose and velocity tasks."""
         units: dict[str, None] = {}
         for task in (part.task for part in self.bound):
             tilt = ["rad"] if task.tilts else []
@@ -77,7 +77,7 @@ class TaskEquations:
         return ", ".join(units)
 
     def targets(self, time: Any, pace: Any = 1) -> Any:
-        """Return the targets of all tasks (poses and velocities) as a column of expressions of the symbol `time`.
+        """Return the targets of all tasks (poses and their velocities) as a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
         rotation and angular velocity (9, 3), direction and angular velocity (3, 3). If `time` is a path parameter,
@@ -132,7 +132,7 @@ class TaskEquations:
 
     @on_scalars
     def right(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the right-hand side b of the task equation J u = b, task velocities minus drift. Shape (size, 1)."""
+        """Return the right side b of the equation J u = b in joint rates u: task rates minus drift. Shape (size, 1)."""
         return -self.residual(base, joints, ca.DM(self.machine.joint_size, 1), targets)
 
     @on_scalars
@@ -194,7 +194,7 @@ class TaskEquations:
         return np.array(angular, dtype=bool)
 
     def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
-        """Return the residual of the task equations for joint accelerations u', (n, 1), with feedback. Shape (size, 1).
+        """Return the residual of the task equations for joint accelerations (n, 1), with feedback. Shape (size, 1).
 
         d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0. `progress` is the
         symbol of the time; or a path parameter, its pace, which is a symbol too, and the rate of the pace, 1/s^2.
@@ -226,7 +226,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target for pose tasks, and velocity residual for velocity tasks. Shape (size, 1)."""
+        """Return pose minus target for pose tasks, and the velocity residual for velocity tasks. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
@@ -295,7 +295,7 @@ class TaskEquations:
 
     @on_scalars
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the pose errors (rows, 1) of velocity tasks' tips relative to a reference configuration."""
+        """Return the pose errors (rows, 1) of the tips of velocity tasks from their poses in a given configuration."""
         rows: list[Any] = [ca.DM(0, 1)]
         for part in (part for part in self.bound if not part.task.is_pose):
             position, rotation = (ca.DM(value) for value in part.pose_in_reference(at_base, at_joints))
@@ -305,7 +305,7 @@ class TaskEquations:
         return ca.vertcat(*rows)
 
     def by_task(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield each task together with the task's own rows of the stacked targets of all tasks."""
+        """Yield each task with its part of the stacked targets of all tasks."""
         at = 0
         for part in self.bound:
             yield part, targets[at : at + part.target_size]
@@ -333,7 +333,7 @@ class TaskEquations:
 
     @cached_property
     def cone_function(self) -> Any:
-        """CasADi Function (base, joints, targets) -> (`cone_cosines`, their gradients in the joint rates)."""
+        """CasADi Function of base, joints, targets: `cone_cosines`, and their time derivatives per unit joint rate."""
         base, joints, targets = self._symbols
         cosines, rates = self.cone_cosines(base, joints, targets), ca.SX.sym("rates", self.machine.joint_size)
         slopes = ca.jacobian(cosines, joints)
@@ -344,14 +344,14 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function (base, joints, targets) -> (J, b, pose error, pose residual)."""
+        """CasADi Function from base, joints and targets to Jacobian J, right side b, pose error and pose residual."""
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
 
     @cached_property
     def pose_residual_function(self) -> Any:
-        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian in the joint positions)."""
+        """CasADi Function from joints, base and targets to the pose residual and its Jacobian in the joints."""
         base, joints, targets = self._symbols
         residual = self.pose_residual(base, joints, targets)
         jacobian = ca.densify(ca.jacobian(residual, joints))
@@ -359,7 +359,7 @@ class TaskEquations:
 
     @cached_property
     def jacobian_function(self) -> Any:
-        """CasADi Function (joints, base) -> Jacobian of all tasks with respect to the joint rates."""
+        """CasADi Function from joints and base to the Jacobian of all tasks with respect to the joint rates."""
         base, joints, _ = self._symbols
         return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
 
@@ -379,7 +379,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
-        """Return the combinations of task equations whose integral vanishes over a cyclic motion. Shape (size, k).
+        """Return the combinations of task equations with zero integral over any cyclic motion. Shape (size, k).
 
         Closure follows from all holonomic rows on a fixed base; on a floating base from the combinations of rows that
         are independent of the base pose while the centre of mass stays.
@@ -393,7 +393,7 @@ class TaskEquations:
             return directions
         if not isinstance(self.machine, FreeFloating):
             return np.zeros((self.size, 0))
-        return directions @ closing_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
+        return directions @ base_independent_combinations(self.machine, self.bound, holonomic, base=base, joints=joints)
 
 
 def _whole(task: TipTask, value: Any) -> Any:

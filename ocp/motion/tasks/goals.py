@@ -45,7 +45,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a start or joint positions to a `Start`; also return its joints (n,), all given, and its base.
+        """Convert joint positions, or a start with known joints, to a `Start`; also return its joints (n,) and base.
 
         Raises:
             ProblemError: The joint positions are missing; or as `checked_configuration`.

@@ -37,7 +37,7 @@ class InFoot:
         require.nonnegative("InFoot: margin", self.margin, unit="m")
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""
+        """Raise ProblemError if the support polygon of a machine is too small for the margin that this rule demands."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -48,7 +48,7 @@ class InFoot:
 
 @dataclass(frozen=True)
 class IndexAtLeast:
-    """Rule that the stability index of the zero moment point (Yoo et al. 2004) is at least `value` in x and y.
+    """Rule that the stability index of the zero moment point (Yoo et al. 2004) is `value` or more in x and in y.
 
     Equations (5) and (6) of that paper. The zero moment point also stays inside the support polygon.
     """
@@ -61,7 +61,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return two opposite corners of the rectangle of sufficient stability index. Shape (2,) each, m."""
+        """Return opposite corners (2,), m, of the rectangle of zero moment points with sufficient stability index."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -122,8 +122,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a zero moment point rule turns into constraints: inward
-    normals n (k, 2) and offsets o (k,), n . point >= o.
+    """Return the support edges, moved inwards by a margin, that a zero moment point rule constrains: inward normals n
+    (k, 2) and offsets o (k,), with n . point >= o inside.
     """
     normals = machine.support.normals
     offsets = (normals * machine.support.vertices).sum(axis=1)
@@ -140,8 +140,8 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances (k, 1), m, of a zero moment point (2, 1) from the support edges, without constant ones;
-    raise ProblemError if a constant one is negative. `external` states whether wrenches act.
+    """Return the distances (k, 1), m, of a zero moment point (2, 1) from the support edges, without the constant ones.
+    Raise ProblemError if a constant distance is negative. `external` states whether external wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
     movable = np.abs(normals @ machine.moving_directions.T).max(axis=1, initial=0.0) > PARALLEL
@@ -159,9 +159,9 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
     return rows[free]
 
 
-def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0: x, 1: y) of the zero moment point that a rule's rectangle must bound because they
-    vary; raise ProblemError if a constant coordinate is outside it.
+def constrained_axes(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
+    """Return the coordinates (0: x, 1: y) of the zero moment point that are not constant, so that constraints must keep
+    them in the rectangle of `zmp`; raise ProblemError if a constant coordinate is outside of the rectangle.
     """
     rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
     low, high = zmp.region(machine)
@@ -212,8 +212,8 @@ LIMITED = {
 
 
 class JointBounds(NamedTuple):
-    """Limits of each joint, in SI units, infinite where there is none: position, and largest absolute values of
-    velocity, acceleration, jerk and torque, and largest power that an actuator delivers. Shape (n,) each.
+    """Limits of each joint in SI units (infinite if there is none): position, and largest absolute velocity,
+    acceleration, jerk and torque, and largest power that an actuator delivers. Shape (n,) each.
     """
 
     lower: Array
@@ -281,7 +281,7 @@ class Limits:
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
     def of_joints(self, chosen: NDArray[Any]) -> Limits:
-        """Return the limits of some of a machine's joints, given as a mask (n,) or as indices in a new order."""
+        """Return the limits of selected joints of a machine, given as a mask (n,) or as indices in a new order."""
         own: dict[str, Any] = {kind: floats(getattr(self, kind)) for kind in LIMITED if np.ndim(getattr(self, kind))}
         return replace(self, **{kind: values[chosen] for kind, values in own.items()})
 

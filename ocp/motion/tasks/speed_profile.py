@@ -24,7 +24,7 @@ Phases = tuple[tuple[float, float], ...]  # durations (s) and jerks (m/s^3) of c
 
 
 class LineMotion(NamedTuple):
-    """Motion along a path at M times: distance covered and its derivatives, in s and m. Shape (M,) each."""
+    """Motion along a path at M times: distance, speed, acceleration and jerk, in s and m. Shape (M,) each."""
 
     t: Array
     distance: Array
@@ -43,7 +43,7 @@ def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple
 
 
 def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
-    """Return the index of the interval between increasing bounds (K + 1,) that contains or is nearest to each place."""
+    """Return, for each place, the index of the interval between increasing bounds (K + 1,) that is nearest to it."""
     return np.asarray(np.clip(np.searchsorted(bounds, places, side=side) - 1, 0, len(np.asarray(bounds)) - 2))
 
 
@@ -80,7 +80,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times (M,) in [0, duration], s; at a jump of the jerk, with the jerk after it."""
+        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, the later jerk counts."""
         words = f"s is outside the schedule, 0 to {self.duration:g} s"
         t = np.atleast_1d(values_within(time, self.duration, "time", words))
         segment = segment_index(self.t, t)
@@ -91,7 +91,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; where the motion stops, its values on arrival."""
+        """Return the motion at distances (M,) from the start, m; at a stop, the motion on arrival."""
         length = float(self.distance[-1])
         words = f"m is off the path, which is {length:g} m long"
         s = np.atleast_1d(values_within(distance, length, "distance", words))
@@ -101,7 +101,7 @@ class SpeedProfile:
         return self._motion(segment, np.where(s == length, np.diff(self.t)[-1], inside))
 
     def peaks(self) -> LineMotion:
-        """Return the motion at all times at which the speed may have a maximum: segment ends and zero acceleration."""
+        """Return distance, speed, acceleration where speed may be largest: segment ends and zeros of acceleration."""
         with np.errstate(divide="ignore", invalid="ignore"):
             zero = -self.acceleration[:-1] / self.jerk
         inside = np.flatnonzero((zero > 0) & (zero < np.diff(self.t)))
@@ -121,13 +121,13 @@ class SpeedProfile:
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 
     def _motion(self, segment: NDArray[np.intp], t: Array) -> LineMotion:
-        """Return the motion at times (M,), s, counted from the starts of given segments (M,)."""
+        """Return the motion at times (M,), s, measured from the starts of segments with given indices (M,)."""
         s, v, a, j = self.distance[segment], self.speed[segment], self.acceleration[segment], self.jerk[segment]
         distance, speed, acceleration = integrate_jerk(v, a, j, t)
         return LineMotion(self.t[segment] + t, s + distance, np.maximum(speed, 0.0), acceleration, j)
 
     def _time_inside(self, segment: NDArray[np.intp], distance: Array) -> Array:
-        """Return the times (M,), counted from the start of given segments (M,), at which distances (M,) are covered."""
+        """Return the times (M,), from the starts of given segments (M,), at which distances (M,) are covered."""
         v, a, j, high = self.speed[segment], self.acceleration[segment], self.jerk[segment], np.diff(self.t)[segment]
         even = (a == 0) & (j == 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -135,8 +135,11 @@ class SpeedProfile:
         todo = np.flatnonzero(~even)
         # Newton steps inside a bracket, since distance increases with time
         high = high[todo]
-        whole = integrate_jerk(v[todo], a[todo], j[todo], high)[0]
-        t[todo] = high * np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0) ** np.where(a[todo] == 0, 0.5, 1)
+        whole, last, _ = integrate_jerk(v[todo], a[todo], j[todo], high)
+        share = np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0)
+        # as if the acceleration were constant
+        reached = np.sqrt((1 - share) * v[todo] ** 2 + share * last**2)
+        t[todo] = np.minimum(2 * share * whole / np.maximum(v[todo] + reached, 1e-300), high)
         low = np.zeros_like(high)
         for _ in range(60):  # more than halving a bracket to the last digit takes
             if not todo.size:
@@ -155,7 +158,7 @@ class SpeedProfile:
 
 
 def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
-    """Return the speed profile through nodes (N + 1,), with two segments of constant jerk between neighbouring nodes.
+    """Return the speed profile through nodes (N + 1,), with two constant jerks between neighbouring nodes.
 
     Over a distance h, the time T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each
     satisfy. Beside a node at rest, where the acceleration is 0, both have the same jerk.
@@ -178,7 +181,7 @@ def profile_through(distance: Array, speed: Array, acceleration: Array) -> Speed
 
 
 def profile_between(distance: Array, speed: Array, rates: tuple[Array, Array]) -> SpeedProfile:
-    """Return the speed profile through nodes (N + 1,), with one segment of constant jerk between neighbouring nodes.
+    """Return the speed profile through nodes (N + 1,), with one constant jerk between neighbouring nodes.
 
     The time T over a distance h follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, where the change a1 - a0 is that of
     the approximate accelerations `rates` at both ends of each interval (N,); the acceleration jumps at nodes.
@@ -223,7 +226,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) reached from `speed` over a distance (m), the inverse of `ramp_distance`."""
+    """Return the greatest speed (m/s) that can be reached from `speed` over a distance (m); inverts `ramp_distance`."""
     # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
     # formula as a quotient without cancellation
     half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)

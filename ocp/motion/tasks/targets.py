@@ -84,7 +84,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return the breaks (k,) of targets, including both ends, that a mesh needs as nodes to represent the targets.
+    """Return those breaks (k,) of targets, including both ends, that a mesh needs as nodes to represent the targets.
 
     Intervals are bisected at the break nearest to their middle until the interpolants of the targets deviate by no more
     than `NODES` allows. A path of many short segments thus needs no more nodes than a smooth path of the same shape.
@@ -116,7 +116,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return times (k,) with times added so that target poses are nearly linear in time between neighbours."""
+    """Add times to given ones until target poses are nearly linear between neighbouring times. Shape (k,)."""
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
     poses, _ = _target_rows(equations)
@@ -133,7 +133,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of the pose values in the column of targets, and the rows of the velocity of each pose."""
+    """Return where the stacked task targets have pose values (indices) and the velocity of each pose (slices)."""
     poses, rates, at = list[int](), list[slice](), 0
     for part in equations.bound:
         for pose, rate in part.target_rows.values():
@@ -144,7 +144,7 @@ def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
 
 
 def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the permitted interpolation error of each target value, from samples (M, size). Shape (size,)."""
+    """Return the permitted interpolation error of each target value, given samples (M, size). Shape (size,)."""
     largest = np.full(values.shape[1], NODES.pose_error)
     for rates in _target_rows(equations)[1]:
         largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
@@ -152,7 +152,7 @@ def _largest_errors(equations: TaskEquations, values: Array) -> Array:
 
 
 def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]:
-    """Return rotations (M, 3, 3) and positions (M, 3) of a machine's tip in world at given configurations."""
+    """Return rotations (M, 3, 3) and positions (M, 3) of a machine's tip in world in given configurations."""
     b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose: Any = machine.tip_pose(b, q)
     function = ca.Function("frames", [b, q], [pose.rotation, pose.position])

@@ -229,7 +229,7 @@ class TipTask:
 
     @property
     def along_reference(self) -> bool:
-        """Whether the task prescribes components along the axes of the frame in which its target pose is given."""
+        """Whether the prescribed components are along the axes of the frame in which the target pose is given."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
@@ -263,7 +263,7 @@ def _refuse_ramps(reason: str, **arguments: Any) -> None:
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task of a path parameter to a task of time, by the CasADi function `clock`: time (s) -> parameter."""
+    """Convert a task of a path parameter to one of time; the function `clock` gives the parameter at a time (s)."""
 
     def velocity(time: Any) -> Any:
         parameter = clock(time)
@@ -289,13 +289,13 @@ class BoundTask(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link whose frame the task moves."""
+        """Name of the link to which the task's frame belongs."""
         return self.task.link or self.tip.robot.tip_link
 
     @property
     def target_rows(self) -> dict[str, tuple[slice, slice]]:
-        """Rows of the column of targets that contain each prescribed target and, in 3 rows, its velocity, by name:
-        "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows).
+        """Rows of each prescribed target, and of its velocity (3 rows), in the column of targets, by name: "position"
+        (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction" (3 rows).
         """
         rows, at = dict[str, tuple[slice, slice]](), 0
         for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
@@ -311,11 +311,11 @@ class BoundTask(NamedTuple):
 
     @property
     def rate_rows(self) -> list[int]:
-        """Indices of the velocities and angular velocities among the targets of a pose task."""
+        """Indices of the velocities and angular velocities in the targets of a pose task."""
         return [row for _, rates in self.target_rows.values() for row in range(rates.start, rates.stop)]
 
     def split_targets(self, targets: Any) -> tuple[Any, Any]:
-        """Split the targets into (position, velocity) and (rotation or direction, angular velocity); None if free."""
+        """Split targets into (position, velocity) and (rotation or direction, angular velocity); None if free."""
         parts = {name: (targets[values], targets[rates]) for name, (values, rates) in self.target_rows.items()}
         if "orientation" in parts:
             parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]
@@ -377,7 +377,7 @@ class BoundTask(NamedTuple):
         return ca.vertcat(angular, linear)
 
     def target_twist(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a target's twist relative to the reference plus pose feedback, in world axes. Shape (6, 1)."""
+        """Return the twist of a target relative to the reference, plus pose feedback, in world axes. Shape (6, 1)."""
         rotation = self.reference_pose(base, joints).rotation
         linear, angular = (
             ca.DM(3, 1) if target is None else ca.mtimes(rotation, target[1]) for target in self.split_targets(targets)
@@ -397,7 +397,7 @@ class BoundTask(NamedTuple):
 
     @property
     def is_holonomic(self) -> NDArray[np.bool_]:
-        """Mask of the velocity components that are rates of pose coordinates and so integrable. Shape (size,)."""
+        """Mask of the velocity components that are time derivatives of pose coordinates. Shape (size,)."""
         task = self.task
         if task.is_pose:
             return np.ones(task.size, dtype=bool)
@@ -428,11 +428,11 @@ def cross_product(a: Any, b: Any) -> Any:
     return ca.mtimes(skew(a), b)
 
 
-def closing_combinations(
+def base_independent_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of the selected task equations that no base motion with a fixed centre of mass affects;
-    raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return.
+    """Return the linear combinations of selected task equations that do not change if the base moves but the centre of
+    mass does not. Raise ProblemError if the momentum moves the centre of mass, so that the joints cannot return.
     """
     jacobians = []
     for bound in bound_tasks:
@@ -457,7 +457,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return the combinations (count, k) of the first `count` rows of a matrix that its other rows also span."""
+    """Return combinations (count, k) of the first `count` rows of a matrix that are in the span of the other rows."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

@@ -94,7 +94,7 @@ class TrackWithRate:
 
 
 class PathTracks(NamedTuple):
-    """Functions of time for the position and orientation of a tool that moves along a path."""
+    """Position and orientation, as functions of time, of a tool that moves along a path."""
 
     position: Callable[[Any], Any]
     orientation: Callable[[Any], Any]
@@ -128,7 +128,7 @@ def checked_speed(speed: Any) -> float:
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return functions of time for a tool that moves along a path; builders that use them need symbols=casadi.MX.
+    """Return position and orientation of a tool on a path as functions of time; problems need symbols=casadi.MX.
 
     The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
@@ -172,7 +172,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Convert a target of a path parameter to one of time, by a CasADi function `clock`: time (s) -> parameter."""
+    """Convert a target of a path parameter to one of time; the function `clock` gives the parameter at a time (s)."""
     if not callable(track):
         return track
 
@@ -197,7 +197,7 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]
 
 
 def on_symbols(build: Callable[[Any], _Result]) -> _Result:
-    """Return `build(SX)` with CasADi's SX symbols or, if interpolants or external functions reject SX, `build(MX)`."""
+    """Return `build(SX)` with CasADi's SX symbols, or `build(MX)` if an expression does not accept SX symbols."""
     try:
         return build(ca.SX)
     except (RuntimeError, NotImplementedError):
@@ -212,7 +212,7 @@ def track_expression(
     label: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a target, a constant or a function of the time since its begin, as a dense expression of `time`.
+    """Return a target (a constant, or a function of the time since it begins) as a dense expression of `time`.
 
     Raises:
         ProblemError: Another shape than those allowed, a value that is not finite, or an expression of anything but the
@@ -246,7 +246,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, label: str) -> Any:
-    """Evaluate a target function; raise ProblemError if it fails, but pass on errors that SX symbols cause."""
+    """Evaluate a target function; raise ProblemError if it fails, but pass on errors that are due to SX symbols."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

@@ -185,7 +185,7 @@ def capture_problem(
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (after.at_start(name) for name in ("base", "joints", "velocities"))
     initial = {
-        "joints": ca.DM(own.arm_weights) * end["joints"], "velocities": before.at_end("velocities"),
+        "joints": ca.DM(own.arm_mask) * end["joints"], "velocities": before.at_end("velocities"),
         "base": own.base_after(end["base"], end["joints"], before.duration),
     }  # fmt: skip
     problem.join(APPROACH, DETUMBLE, initial)
@@ -202,7 +202,7 @@ def solve_capture(
     method: Collocation = POINTS,
     **options: Any,
 ) -> Solution:
-    """Solve `capture_problem` with its options within its limits everywhere, first on the mesh `method`."""
+    """Solve `capture_problem` so that limits hold between the mesh nodes as well, starting on the mesh `method`."""
 
     def declare(constraints: ClearanceConstraints | None) -> Problem:
         return capture_problem(chaser, capture, clearance_constraints=constraints, **options)
@@ -247,7 +247,7 @@ def chained_capture(
 
     first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
-    end["joints"] = own.arm_weights * end["joints"]
+    end["joints"] = own.arm_mask * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
     def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
@@ -295,8 +295,8 @@ class _Capture:
         return cls(chaser, capture, pair, state, shared)
 
     @property
-    def arm_weights(self) -> Array:
-        """Factor that multiplies each joint position as the detumbling starts: 0 for reaction wheels, else 1."""
+    def arm_mask(self) -> Array:
+        """Mask of the arm's joints: 1, and 0 for reaction wheels, whose angles count from 0 again in the detumbling."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -330,7 +330,7 @@ class _Capture:
         return Frame(ca.mtimes(back, tip.rotation), ca.mtimes(back, tip.position - grasped.position))
 
     def _require_inside(self, cone: Cone) -> None:
-        """Raise ProblemError if the tip starts near the grasp but outside the cone."""
+        """Raise ProblemError if the tip starts near the grasp but outside the cone of approach."""
         place = ca.DM(self.tip_in_grasp(self.start.base, self.start.joints, self.start.target_base).position)
         distance, inside = float(ca.norm_2(place)), float(cone.inside(place))
         if inside < 0:
@@ -372,7 +372,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
+        """Return the base configuration at a time: its position follows from uniform motion of the centre of mass.
 
         The dynamics conserve this motion and the norm of the quaternion. Their continuity would be a condition that no
         control influences, and would leave the second-order conditions undetermined.
@@ -387,7 +387,7 @@ class _Capture:
 
 
 def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joint positions, joint velocities and base configuration at the end of the guess of an approach."""
+    """Return joint positions, joint velocities and base configuration at the end of an approach's initial guess."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)

@@ -40,7 +40,7 @@ def join_target(chaser: Robot, target: Robot) -> Robot:
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Check a chaser and its target, and return both as one robot; see `join_target`."""
+    """Check a chaser and its target, and return them as one robot, joined at their tip frames."""
     for name, machine in (("chaser", chaser), ("target", target)):
         if require.instance(f"capture: {name}", machine, FreeFloating).robot.tip is None:
             raise ProblemError(f"capture: the robot of the {name} needs a tip", name=name, value=machine)
@@ -170,7 +170,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Track a tip path at constant wheel speeds; return the final pose error, m and rad, and the guess."""
+        """Track a tip path at constant wheel speeds; return the final pose error, m or rad, and an initial guess."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()

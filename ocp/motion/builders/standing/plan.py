@@ -99,7 +99,7 @@ def guess_in_time(
 def _extensible_problem(
     steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> Phases:
-    """Declare the problem of footsteps that may take longer than requested, at a cost above all others."""
+    """Declare the problem of footsteps that may take longer than requested, at a cost that outweighs all others."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -399,7 +399,7 @@ def _error_of_tips(
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:
-    """Return whether an audit finding concerns variable bounds or a path constraint without equations."""
+    """Return whether an audit finding concerns bounds of variables, or a path constraint of inequalities only."""
     rows = problem.declared.path.get(finding)
     if rows is None:
         return finding.startswith("bounds of ")

@@ -43,8 +43,8 @@ from ocp.motion.tasks.limits import (
     Pinned,
     ZmpRule,
     check_rule,
+    constrained_axes,
     foot_rows,
-    index_rows,
     is_finite,
 )
 from ocp.motion.tasks.tip_task import TipTask
@@ -257,7 +257,7 @@ def constrain_tips(
     moving: bool,
     level: str = "acceleration",
 ) -> None:
-    """Constrain the tips to the accelerations of their tasks and, if `moving`, start velocities, or to the poses alone.
+    """Constrain the tips to poses if `level` is "position", else to accelerations and, if `moving`, start velocities.
 
     `motion` has base, joint positions, rates and accelerations.
     """
@@ -333,7 +333,7 @@ def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost of a sampled motion as in `standing_problem`, without jerks, by the trapezoidal rule."""
+    """Return the cost of `standing_problem`, without jerk terms, for a sampled motion, by the trapezoidal rule."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)
@@ -359,7 +359,7 @@ def _constrain_ground(
     point = center_of_pressure(reaction)
     if isinstance(zmp, IndexAtLeast):
         low, high = zmp.region(machine)
-        rows = index_rows(machine, zmp, point, bool(wrenches))
+        rows = constrained_axes(machine, zmp, point, bool(wrenches))
         problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows], unit="m")
     elif isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))

@@ -141,7 +141,7 @@ class Steps:
         return np.array([self.robot.joint_names.index(name) for name in stance.robot.joint_names], dtype=np.intp)
 
     def swings(self, k: int) -> tuple[Swing, ...]:
-        """Return the motions through the air in phase k of feet that stood before or land at the end of the phase."""
+        """Return the swings in phase k: motions of feet in the air that stood before or land at the phase's end."""
         swings = []
         for name in self.feet:
             if name in self.phases[k].footholds:
@@ -229,7 +229,7 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: Mapping[str, Foothold] | None = None) -> TaskEquations:
-    """Return equations that keep feet, by default all but the first, on footholds in the directions of joint motion."""
+    """Return the tip task equations that keep feet, by default all feet but the first, on their footholds."""
     if footholds is None:
         footholds = {name: stance.footholds[name] for name in stance.other_feet}
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
@@ -306,7 +306,7 @@ def check_placed(stance: Stance, joints: Array) -> None:
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Return initial guesses of the joint positions, velocities and accelerations in each phase, in its stance's order.
+    """Return initial guesses of the joint positions, velocities and accelerations in each phase, in stance joint order.
 
     Halfway, a foot is by `lift`, m, above the line between its footholds. `start` is in the robot's joint order.
     """
@@ -331,7 +331,7 @@ def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Ar
 
 
 def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return, by the name of the foot, the raised poses of swinging feet midway between their footholds."""
+    """Return the poses of swinging feet, keyed by foot name, when they are raised midway between two footholds."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:

@@ -152,7 +152,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes, as inward normals and offsets, in which the zero moment point is required to be."""
+    """Return the half-planes that must contain the zero moment point, as inward normals and offsets, m."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
@@ -170,7 +170,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of torque and ground limits with the least sum; None if the tasks are impossible."""
+    """Return the limit violations of least sum over joint accelerations that fulfil the tasks; None if none do."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):

@@ -234,13 +234,13 @@ def _constrain_swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of the distinct rows of a constraint; in planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint; rows of sole corners coincide in planar machines."""
     values = _at_random(rows, joints)
     return [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return those distances, m, of the center of mass from support edges that the joints can change. Shape (k, 1)."""
+    """Return the distances (k, 1) of the center of mass from the support edges, m, without those that are constant."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
@@ -375,7 +375,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, k: int, times: Array, motion: tuple[Array, ...], *, foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return, by name, the quantities (M, ...) of `StepsMotion` along a motion in phase k.
+    """Return the samples of a motion in phase k by name, as in `StepsMotion`: loads, margins and torques at M times.
 
     The motion and the loads of all feet but the first, in the rows `Stance.load_rows`, are in the stance's joint order.
     """
@@ -412,7 +412,7 @@ def sample_stance(
 
 
 def _symbols_of_loads(stance: Stance) -> tuple[tuple[Any, Any, Any], Any, dict[str, Any]]:
-    """Return symbols of the joint motion, those of the loads of all feet but the first, and the loads of all feet."""
+    """Return symbols of the joint motion, symbols of the loads on all feet but the first, and the loads on all feet."""
     n = stance.joint_size
     symbols = ca.SX.sym("q", n), ca.SX.sym("qd", n), ca.SX.sym("qdd", n)
     rows = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from models import FreeFloating, Link, Robot, Wrench, mass_matrix, planar_chain, with_wheels
+from models import FreeFloating, Link, Robot, Wrench, find_wheels, mass_matrix, planar_chain, with_wheels
 from models.paths.splines import exponential
 from ocp import (
     Collocation,
@@ -23,9 +23,11 @@ from ocp import (
     minimum_velocity_problem,
     solve,
 )
+from ocp import plan as plan_motion
 from scripts.robots.simulation import mujoco_model
 from tests.models.machines.test_actuators import satellite, state, wheeled
 from tests.models.robot.trees import Array
+from tests.ocp.motion.tasks.space_tasks import floating_manipulator
 
 nan = np.nan
 SHORT = Collocation(6, 4)
@@ -130,11 +132,16 @@ def test_two_arms_work_and_the_base_does_not_turn() -> None:
     )
 
 
-def turned_in_mujoco(machine: FreeFloating, plan: Solution) -> float:
-    """Return the angle, rad, by which MuJoCo's angular momentum turns the base while the joints move as planned."""
+def turned_in_mujoco(machine: FreeFloating, plan: Any, name: str = "velocities", wheels: float = 1.0) -> float:
+    """Return the angle, rad, by which MuJoCo's angular momentum turns the base while the joints move as planned.
+
+    Args:
+        name: Of the joint rates. wheels: Share of the planned rates at which the wheels turn.
+    """
     model = mujoco_model(machine.robot)
     data, times = mujoco.MjData(model), np.linspace(0.0, plan.horizon, 1001)
-    joints = [model.joint(name) for name in machine.robot.joint_names]
+    joints = [model.joint(joint) for joint in machine.robot.joint_names]
+    shares = [wheels if joint in find_wheels(machine.robot) else 1.0 for joint in machine.robot.joint_names]
 
     def momentum(velocity: Array) -> Array:
         data.qvel[:] = velocity
@@ -143,7 +150,7 @@ def turned_in_mujoco(machine: FreeFloating, plan: Solution) -> float:
         return np.array(data.subtree_angmom[1])
 
     rates = []
-    for positions, velocities in zip(plan.at(times)["joints"], plan.at(times)["velocities"], strict=True):
+    for positions, velocities in zip(plan.at(times)["joints"], shares * plan.at(times)[name], strict=True):
         moving = np.zeros(model.nv)
         for joint, position, velocity in zip(joints, positions, velocities, strict=True):
             data.qpos[joint.qposadr[0]], moving[joint.dofadr[0]] = position, velocity
@@ -165,14 +172,32 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
     assert held.audit().feasible
 
 
+@pytest.mark.long
+def test_wheels_hold_the_attitude_of_a_published_space_arm_while_its_tip_moves() -> None:
+    """A start and the tip's path are given; of the ten joints four are redundant."""
+    robot = with_wheels(floating_manipulator().robot, np.eye(3), 0.05, momentum=40.0, torque=1.0, mass=2.0)
+    machine, start = FreeFloating(robot), np.array([0.3, -0.5, 0.4, 0.9, 0.2, 0.7, 0.1, *[0.0] * 3])
+    shift = np.array([-0.15, 0.2, 0.1])
+    place = np.array(ca.DM(machine.tip_pose(machine.base_home(), start).position)).ravel()
+    tool = TipTask(position=along(place, shift), duration=20.0)
+    hold = TipTask(link=robot.root, orientation=np.eye(3), duration=20.0)
+    weights = [1.0] * 7 + [1e-7] * 3  # a wheel turns by hundreds of rad
+    result = plan_motion(machine, [tool, hold], start=start, cost=Cost(weights=weights))
+    assert result.audit().passed
+    assert turned_in_mujoco(machine, result, "rates") < 1e-6
+    assert turned_in_mujoco(machine, result, "rates", wheels=0.99) > 1e-6  # the check notices one per cent
+    end = machine.tip_pose(result.at(20.0)["base"], result.at(20.0)["joints"])
+    np.testing.assert_allclose(np.array(ca.DM(end.position)).ravel(), place + shift, atol=1e-6)
+
+
 def test_turning_that_costs_is_less() -> None:
     chain = planar_chain([0.8, 0.6], [4.0, 3.0], base=Link("hub", 40.0, (0, 0, 0), 4.0 * np.eye(3)))
     machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.02), "planar")
     request: dict[str, Any] = {"end": [1.2, 0.3, nan], "setup": DynamicsSetup(end_velocity=[0.0, 0.0, nan])}
 
     def most(effort: Cost | None) -> float:
-        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], cost=effort, **request), SHORT)
-        return float(np.abs(plan["base"][:, 2]).max())
+        held = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], cost=effort, **request), SHORT)
+        return float(np.abs(held["base"][:, 2]).max())
 
     assert most(Cost(velocity=0.0, effort=1.0, turning=1e4)) < 0.1 * most(None)
 

@@ -82,6 +82,27 @@ def crx(limit: float = np.inf) -> FixedBase:
     return denavit_hartenberg(rows, limit=limit)
 
 
+IIWA_ROWS = [
+    (0, -RIGHT, 0.36), (0, RIGHT, 0), (0, RIGHT, 0.42), (0, -RIGHT, 0), (0, -RIGHT, 0.4), (0, RIGHT, 0), (0, 0, 0.126)
+]  # fmt: skip
+"""Standard Denavit-Hartenberg rows of the LBR iiwa 14 R820, by its data sheet."""
+
+
+def iiwa() -> FixedBase:
+    """The LBR iiwa 14 R820 with the limits of its data sheet, without shapes."""
+    robot = denavit_hartenberg(IIWA_ROWS).robot
+    most = np.radians([170, 120, 170, 120, 170, 120, 175])
+    rates = np.radians([85, 85, 100, 75, 130, 135, 135])
+    limits = iter(zip(most, rates, strict=True))
+    joints = []
+    for joint in robot.joints:
+        if joint.moves:
+            angle, rate = next(limits)
+            joint = replace(joint, kind="revolute", lower=-angle, upper=angle, velocity=rate)
+        joints.append(joint)
+    return FixedBase(replace(robot, joints=tuple(joints)))
+
+
 @cache
 def build(name: str) -> FixedBase:
     """One of the arms."""

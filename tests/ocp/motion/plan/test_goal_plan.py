@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import coal
 import numpy as np
+import pinocchio
 import pytest
+import ruckig
 
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.checks import Array
@@ -25,6 +29,7 @@ from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.tasks.goals import Cost
 from scripts.robots.robots import PANDA
 from tests.families import some
+from tests.models.shapes.shape_oracles import in_coal
 from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider
 
 BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))
@@ -251,24 +256,93 @@ def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jer
     np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
 
 
+PANDA_START = np.array([-0.8, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785])
+PANDA_LIMITS = Limits(
+    acceleration=[15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0],
+    jerk=[7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0],
+)
+"""Of the data sheet; limits of rates and torques are those of the robot description."""
+WALL, LOW_BOX, TABLE = (
+    Box((0.5, 0.04, 0.45), (0.6, 0.0, 0.225)),
+    Box((0.2, 0.2, 0.2), (0.45, 0.45, 0.1)),
+    Box((1.6, 1.6, 0.05), (0.0, 0.0, -0.06)),
+)
+CLEARANCE = 0.01
+
+
+def panda_plan(goal: Goal) -> Plan:
+    folder = str(PANDA.path.parents[3])
+    scene = Scene([WALL, LOW_BOX, TABLE], clearance=CLEARANCE, folders=[folder])
+    machine, cost = FixedBase(PANDA.read()), Cost(velocity=0.0, time=1.0)
+    return plan_motion(machine, goal, start=PANDA_START, limits=PANDA_LIMITS, cost=cost, scene=scene)
+
+
+def assert_the_panda_keeps_its_limits(plan: Plan) -> Any:
+    """Check rest, limits and distances at samples by Pinocchio and coal, with the meshes of the robot description.
+
+    Return the pose of the hand at the end.
+    """
+    model = pinocchio.buildModelFromUrdf(str(PANDA.path))
+    geometry = pinocchio.buildGeomFromUrdf(
+        model, str(PANDA.path), pinocchio.GeometryType.COLLISION, package_dirs=[str(PANDA.path.parents[4])]
+    )
+    data, places = model.createData(), geometry.createData()
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, 401))
+    np.testing.assert_allclose(sample.joints[0], PANDA_START, atol=1e-9)
+    np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
+    assert (np.abs(sample.rates) <= model.velocityLimit[:7] * 1.001).all()
+    assert (np.abs(sample.accelerations) <= np.array(PANDA_LIMITS.acceleration) * 1.001).all()
+    jerks = np.diff(sample.accelerations, axis=0) / np.diff(sample.t)[:, None]
+    assert (np.abs(jerks) <= np.array(PANDA_LIMITS.jerk) * 1.001).all()
+    least, boxes = np.inf, [in_coal(box) for box in (WALL, LOW_BOX, TABLE)]
+    for values in zip(sample.joints, sample.rates, sample.accelerations, strict=True):
+        q, v, a = (np.append(value, [finger] * 2) for value, finger in zip(values, (0.02, 0.0, 0.0), strict=True))
+        torques = pinocchio.rnea(model, data, q, v, a)[:7]
+        assert (np.abs(torques) <= model.effortLimit[:7] * 1.001).all()
+        pinocchio.updateGeometryPlacements(model, data, geometry, places, q)
+        for body, at in zip(geometry.geometryObjects, places.oMg, strict=True):
+            if body.parentJoint:  # the base stands in the table
+                here = coal.Transform3s(at.rotation, at.translation)
+                for box, there in boxes:
+                    shape = (body.geometry, here, box, there, coal.DistanceRequest(), coal.DistanceResult())
+                    least = min(least, coal.distance(*shape))
+    assert least >= CLEARANCE - 1e-6
+    pinocchio.framesForwardKinematics(model, data, q)
+    return data.oMf[model.getFrameId(plan.machine.robot.tip_link)]
+
+
 @pytest.mark.long
 def test_the_panda_moves_among_a_wall_a_box_and_a_table_in_the_least_time_of_its_slowest_joint() -> None:
-    """Limits of acceleration and jerk: data sheet; of rates and torques: robot description."""
+    """The time of one joint alone, by Ruckig, is a lower bound; the straight motion collides with the wall."""
+    goal = PANDA_START * [-1.0, *[1.0] * 6]
     machine, folder = FixedBase(PANDA.read()), str(PANDA.path.parents[3])
-    wall, box = Box((0.5, 0.04, 0.45), (0.6, 0.0, 0.225)), Box((0.2, 0.2, 0.2), (0.45, 0.45, 0.1))
-    scene = Scene([wall, box, Box((1.6, 1.6, 0.05), (0.0, 0.0, -0.06))], clearance=0.01, folders=[folder])
-    start, goal = ([side, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785] for side in (-0.8, 0.8))
-    limits = Limits(
-        acceleration=[15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0],
-        jerk=[7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0],
-    )
-    collisions = StraightMotions(CollisionScene(machine, **scene.collision_options))
-    assert not collisions.are_clear(np.array([start]), np.array([goal]))[0]
-    cost = Cost(velocity=0.0, time=1.0)
-    plan = plan_motion(machine, Goal(joints=goal), start=start, limits=limits, cost=cost, scene=scene)
+    collisions = StraightMotions(CollisionScene(machine, [WALL, LOW_BOX, TABLE], folders=[folder]))
+    assert not collisions.are_clear(PANDA_START[None], goal[None])[0]
+    begin = time.process_time()
+    plan = panda_plan(Goal(joints=goal))
+    seconds = time.process_time() - begin
+    assert plan.audit().feasible
+    assert_the_panda_keeps_its_limits(plan)
+
+    alone, profile = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    alone.current_position, alone.target_position = PANDA_START[:1].tolist(), goal[:1].tolist()
+    alone.max_velocity, alone.max_acceleration, alone.max_jerk = [2.175], [15.0], [7500.0]
+    ruckig.Ruckig(1).calculate(alone, profile)
+    assert profile.duration * (1 - 1e-6) <= plan.horizon <= 1.001 * profile.duration
+    assert plan.bound == pytest.approx(profile.duration, rel=1e-6)
+    assert seconds < 5.0
+
+
+@pytest.mark.long
+def test_the_panda_moves_to_a_pose_of_its_hand_behind_the_wall() -> None:
+    place, down = np.array([0.45, 0.35, 0.45]), np.array([0.0, 1.0, 0.0, 0.0])
+    plan = panda_plan(Goal(position=place, orientation=down))
     assert plan.audit().feasible
     assert plan.bound is not None
-    assert plan.bound <= plan.cost <= 1.001 * plan.bound
+    assert plan.bound <= plan.cost <= 1.03 * plan.bound
+    hand = assert_the_panda_keeps_its_limits(plan)
+    np.testing.assert_allclose(hand.translation, place, atol=1e-6)
+    np.testing.assert_allclose(hand.rotation, np.diag([1.0, -1.0, -1.0]), atol=1e-6)
 
 
 def test_of_many_goals_the_nearest_and_the_most_distant_ones_are_kept() -> None:

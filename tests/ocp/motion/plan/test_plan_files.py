@@ -13,9 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.interpolate import BPoly
 
 from models import FixedBase, FreeFloating, Link, Machine, Mimic, Standing, planar_chain, rectangle
-from ocp import ProblemError, Solution
+from ocp import ProblemError, Solution, TipTask
 from ocp.motion.plan import Candidate, Plan, Reason, Rejection
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.result.solved_plan import SolvedPlan
@@ -23,8 +24,8 @@ from ocp.motion.schedule import JointTrajectory
 from ocp.problem.record_reader import unpack_record
 from ocp.problem.record_writer import pack_record
 from tests.models.robot.trees import numeric
-from tests.ocp.motion.plan.motions import planned
-from tests.ocp.motion.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas
+from tests.ocp.motion.plan.motions import DOWN, curved_seam, plan_bare, planned
+from tests.ocp.motion.tasks.space_tasks import floating_manipulator, floating_panda, panda, two_pandas, ur5
 from tests.ocp.test_faults import run
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
@@ -270,6 +271,23 @@ def test_a_message_is_read_back() -> None:
     np.testing.assert_allclose(again.t, instance.t, atol=1e-9)
     for kind in ("positions", "velocities", "accelerations"):
         np.testing.assert_array_equal(getattr(again, kind), getattr(instance, kind))
+
+
+def test_a_controller_that_interpolates_a_message_of_eight_milliseconds_follows_the_plan() -> None:
+    """Quintic polynomials between points, as the JointTrajectoryController of ROS 2 has them, from rest to rest."""
+    task = TipTask.along(curved_seam(), 0.1, acceleration=0.5, jerk=5.0, direction=DOWN)
+    result = plan_bare(ur5(), task, search="start")
+    points = result.to_ros(0.008)["points"]
+    times = [point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"] for point in points]
+    np.testing.assert_allclose(times[:-1], 0.008 * np.arange(len(times) - 1), atol=1e-9)
+    kinds = ("positions", "velocities", "accelerations")
+    values = np.array([[point[kind] for kind in kinds] for point in points])
+    np.testing.assert_allclose(values[[0, -1], 1:], 0.0, atol=1e-5)
+    quintic = BPoly.from_derivatives(times, values)
+    fine = np.linspace(0.0, result.horizon, 20_001)
+    motion = result.at(fine)
+    np.testing.assert_allclose(quintic(np.minimum(fine, times[-1])), motion["joints"], atol=1e-6)
+    np.testing.assert_allclose(quintic.derivative()(np.minimum(fine, times[-1])), motion["rates"], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["seam_ur5", "seam_space_arm"])

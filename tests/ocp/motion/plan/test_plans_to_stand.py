@@ -9,11 +9,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import pinocchio
 import pytest
 
-from models import Standing, Support, rectangle
+from models import STANDING_STARTS, Standing, Support, rectangle, standing_example
 from models.paths import rest_to_rest
-from ocp import Cost, Limits, ProblemError, TipTask
+from ocp import Cost, InFoot, Limits, ProblemError, Scene, TipTask
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.plan import Plan, plan
 from tests.models.machines.standing_machines import planar_machine
@@ -192,6 +193,63 @@ def test_a_saved_plan_is_the_same_motion(tmp_path: Path) -> None:
     assert again.audit().passed
     times = inside(again)
     np.testing.assert_array_equal(again.at(times)["joints"], reached().at(times)["joints"])
+
+
+def published_model() -> Any:
+    """Return the five rods of Yoo et al. 2004 in Pinocchio, by their printed lengths and masses."""
+    model, parent, place = pinocchio.Model(), 0, pinocchio.SE3.Identity()
+    data = zip((0.44, 0.44, 0.52, 0.26, 0.18), (6.02, 14.0, 35.0, 3.92, 2.38), strict=True)
+    for k, (length, mass) in enumerate(data):
+        parent = model.addJoint(parent, pinocchio.JointModelRX(), place, f"joint{k}")
+        rod = mass * length**2 / 12 * np.diag([1.0, 0.0, 1.0])
+        model.appendBodyToJoint(
+            parent, pinocchio.Inertia(mass, np.array([0, length / 2, 0]), rod), pinocchio.SE3.Identity()
+        )
+        place = pinocchio.SE3(np.eye(3), np.array([0.0, length, 0.0]))
+    model.addFrame(pinocchio.Frame("tip", parent, place, pinocchio.FrameType.OP_FRAME))
+    return model
+
+
+@pytest.mark.parametrize("force", [20.0, pytest.param(200.0, marks=pytest.mark.long)])
+def test_a_hand_that_is_pushed_for_a_moment_goes_on_and_stands_by_pinocchio(force: float) -> None:
+    """A push of Gaussian shape, N, 3 s after the start, while the hand is lifted by 0.8 m and lowered again."""
+    robot, start, margin = standing_example(), STANDING_STARTS[1], 0.02
+    place = tip_at(robot, start)[1:]
+
+    def push(t: Any) -> Any:
+        return force * ca.exp(-(((t - 3.0) / 0.3) ** 2) / 2)
+
+    def height(t: Any) -> Any:
+        return place[1] + 0.4 * (1 - ca.cos(t))
+
+    result = plan(
+        robot,
+        TipTask(position=lambda t: [place[0], height(t)], rows=ROWS),
+        2 * np.pi,
+        start=start,
+        limits=Limits(velocity=6.0, acceleration=60.0, zmp=InFoot(margin=margin)),
+        scene=Scene(wrenches=lambda t, tip: [robot.tip_wrench((0.0, push(t), 0.0))]),
+    )
+    assert result.audit().passed
+
+    model, step, points, forces = published_model(), 1e-4, [], []
+    data, tip = model.createData(), model.getFrameId("tip")
+    for t in inside(result):
+        before, q, after = result.at(t + np.array([-step, 0.0, step]))["joints"]
+        rates, second = (after - before) / (2 * step), (after - 2 * q + before) / step**2
+        change = pinocchio.computeCentroidalMomentumTimeVariation(model, data, q, rates, second)
+        pinocchio.updateFramePlacements(model, data)
+        hand, centre = data.oMf[tip].translation, data.com[0]
+        np.testing.assert_allclose(hand[1:], [place[0], float(height(t))], atol=1e-5)
+        weight, outside = data.mass[0] * np.array([0, 0, -GRAVITY]), np.array([0.0, float(push(t)), 0.0])
+        ground = change.linear - weight - outside
+        moment = np.cross(centre, change.linear) + change.angular - np.cross(centre, weight) - np.cross(hand, outside)
+        points.append(moment[0] / ground[2])
+        forces.append(ground[2])
+    assert min(forces) > 0
+    excess = max(-0.1 + margin - min(points), max(points) - 0.2 + margin)
+    assert excess < result.audit()["zero moment point"].value + 1e-5  # of the requested margin
+    assert result.audit()["zero moment point"].value < 0.1 * margin
 
 
 def test_a_foot_beside_the_plane_in_which_all_moves_is_refused() -> None:

@@ -11,13 +11,15 @@ import pytest
 
 from models import FixedBase, planar_chain
 from models.checks import Array
-from ocp import IkOptions, SolveError, TipTask, Unreachable, inverse_kinematics
+from ocp import IkOptions, SolveError, TipTask, Unreachable, inverse_kinematics, plan
 from ocp.errors import ProblemError
 from ocp.motion.builders.tool_motion import ERRORS
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.tasks.checks import CHECKS, clip_to_limits
 from ocp.motion.tasks.equations import bind
 from tests.families import some
 from tests.ocp.motion.plan.motions import plan_bare
+from tests.sweep.global_plans import random_task
 from tests.sweep.singular import PERTURBED, Motion, damped_cost, machine, motions, result
 
 DAILY = (
@@ -50,6 +52,34 @@ def test_a_relaxed_motion_does_its_task_within_the_bound() -> None:
     errors = bind(machine("ur5"), task).errors(t, None, instance.at(t)["joints"])
     assert np.abs(errors).max() <= 1e-5 * np.sqrt(2 * instance.cost * 3.0)
     assert np.abs(errors).max() < 1e-7
+
+
+def cost_of_rates(motion: SolvedPlan) -> float:
+    """The integral of half the squared joint rates."""
+    points, weights = np.polynomial.legendre.leggauss(6)
+    ends = np.unique(motion.t)
+    t = ends[:-1, None] + np.diff(ends)[:, None] * (points + 1) / 2
+    squares = (motion.at(t.ravel())["rates"] ** 2).sum(axis=1).reshape(t.shape)
+    return float(np.diff(ends) @ squares @ weights) / 4
+
+
+def test_the_cost_of_a_plan_does_not_contain_deviations_from_relaxed_tasks() -> None:
+    motion = Motion("ur5", "straight", "in", False, 3.0)
+    task = motion.task(motion.joints, motion.displacement)
+    instance = plan_bare(machine("ur5"), task, start=motion.joints)
+    assert instance.cost == pytest.approx(cost_of_rates(instance), rel=1e-9)
+    assert instance.cost < instance.solution.cost
+    assert next(each for each in instance.candidates if each.passed).cost == instance.cost
+
+
+@pytest.mark.long
+def test_the_cost_of_a_plan_at_its_velocity_limits_is_that_of_its_rates() -> None:
+    """The limits are so low that the tasks can only be done with a deviation, within their tolerance."""
+    arm, task = random_task("slow", 86)
+    result = plan(arm, task, search="global", scene=False)
+    assert isinstance(result, SolvedPlan)
+    assert result.cost == pytest.approx(cost_of_rates(result), rel=1e-6)
+    assert result.solution.cost > 100 * result.cost
 
 
 @pytest.mark.long

@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import FreeFloating, center_of_mass
+from models import FreeFloating, Link, center_of_mass, planar_chain, with_wheels
 from models.examples import paper_example
-from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
+from ocp import Candidate, Cost, Plan, SolveError, TipTask, Unreachable, console, plan
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import PlanOptions, checked_request
 from ocp.motion.result.candidate import Reason, Rejection, Stage
@@ -176,3 +176,27 @@ def test_of_failing_motions_a_few_of_each_search_are_tried_and_the_others_report
     assert f"{rest} of {len(tried) + rest} candidates: not tried: the 8 lowest-cost motions of its search fail" in str(
         caught.value
     )
+
+
+def test_the_search_ends_at_its_time_limit() -> None:
+    request = checked_request(paper_example(), example(3.5), None, PlanOptions(start=START))
+    with console.time_limited(0.0), pytest.raises(console.TimeLimitReached):
+        CellSearch(request, START[None])
+
+
+def test_a_light_wheel_that_turns_far_is_searched_as_a_heavy_one_that_turns_little() -> None:
+    """With a share of the inertia it turns inversely as far, for the same cost if its weight has the squared share."""
+    start, costs, samples = np.array([0.4, -0.9, 0.0]), list[float](), list[int]()
+    for share in (1.0, 1e-3):
+        chain = planar_chain([0.8, 0.6], [4.0, 3.0], base=Link("hub", 40.0, (0, 0, 0), 4.0 * np.eye(3)))
+        machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.001 * share), "planar")
+        reach = TipTask(velocity=[0.1], rows=[4], duration=4.0)
+        hold = TipTask(link="hub", velocity=[0.0], rows=[2], duration=4.0)
+        cost = Cost(weights=[1.0, 1.0, 1e-6 * share**2])
+        request = checked_request(machine, [reach, hold], None, PlanOptions(start=start, cost=cost))
+        ((motion,), *_) = CellSearch(request, start[None]).local_motions()
+        costs.append(float(motion.cost.min()))
+        samples.append(len(motion.t))
+        assert np.ptp(motion.joints[0, :, 2]) > 50.0 / share
+    assert samples[0] == samples[1]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-2)

@@ -50,6 +50,7 @@ def test_the_obstruction_is_reported_and_the_relaxed_task_is_met(seed: int) -> N
     end = refused.value
     assert end.time is not None
     assert 0 <= end.time < end.until <= 2.0
+    assert end.proven == ("no motion does the tasks" in str(end))
     first = end.obstructions[0]
     assert (end.name, end.value, end.limit) == (first.name, first.value, first.limit)
     assert first.kind in ("step", "limit")
@@ -70,7 +71,11 @@ def test_the_obstruction_is_reported_and_the_relaxed_task_is_met(seed: int) -> N
     assert max(off) == pytest.approx(gives.amount, rel=1e-6)
     assert f"{gives.amount:.3g} m off" in str(end)
     again = pickle.loads(pickle.dumps(end))
-    assert (str(again), again.time, again.until, again.name) == (str(end), end.time, end.until, end.name)
+    fields = ("time", "until", "name", "proven", "segments")
+    assert (str(again), *(getattr(again, each) for each in fields)) == (
+        str(end),
+        *(getattr(end, each) for each in fields),
+    )
     # no joint is faster than twice what the stop says it would have to be: so much faster there is a motion
     if all(stop.kind == "step" for stop in end.obstructions):
         fast = 2 * max(stop.value / stop.limit for stop in end.obstructions)

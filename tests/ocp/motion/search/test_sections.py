@@ -147,6 +147,7 @@ def test_obstacles_are_named_with_the_waypoint() -> None:
             Waypoints(places, turns, step=STEP),
             scene=Scene(obstacles=[box], ignored=problem_of("fetch__square").ignored),
         )
+    assert not refused.value.proven
     assert refused.value.time is not None
     assert refused.value.time < 20 <= refused.value.until + 10
     assert "obstacle 0" in str(refused.value)

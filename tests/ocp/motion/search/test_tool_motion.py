@@ -1,8 +1,10 @@
-"""What a path through tool poses costs at least, by the motion of the tool alone, whatever joints an arm has."""
+"""Lower bounds of the cost of joint paths and motions from the motion of the tool alone."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,11 +14,13 @@ from models import FixedBase, Joint, Link, Robot
 from models.checks import Array
 from models.robot.parts import Kind
 from models.robot.rebuild import lock_joints, mount_on_rail
-from ocp import Limits, ProblemError, Waypoints, plan
+from ocp import Cost, Limits, ProblemError, TipTask, Waypoints, plan
+from ocp.motion.plan.planner import PlanOptions, checked_request
 from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.shortening import PathPoses
-from ocp.motion.search.task_search import tool_motion_bound
+from ocp.motion.search.task_search import tool_motion_bound, tool_rate_bound
 from tests.models.robot.trees import random_robot
 from tests.ocp.motion.plan.test_waypoints import poses
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, panda_arm
@@ -84,6 +88,80 @@ def test_of_a_single_joint_the_bound_is_exact(kind: Kind) -> None:
         cost = each(np.array([1.7]))
         length = cost.evaluate(np.diff(path, axis=0), 1.0).sum()
         assert bound(machine, at_tip(machine, path), cost) == pytest.approx(length, rel=1e-6)
+
+
+def random_chain(seed: int) -> FixedBase:
+    """Seven joints in series, most of which turn."""
+    rng, names = np.random.default_rng(seed), ["base", *"abcdef", "tool"]
+    joints = []
+    for k, (below, above) in enumerate(pairwise(names)):
+        kind: Kind = "prismatic" if rng.random() < 0.2 else "revolute"
+        axis, place = rng.normal(size=3), rng.uniform(-0.3, 0.3, 3)
+        joints.append(Joint(f"joint{k}", kind, below, above, (*place,), axis=(*axis,), lower=-1.5, upper=2.0))
+    return FixedBase(Robot(tuple(Link(name) for name in names), tuple(joints), "tool", (0.1, -0.05, 0.2)))
+
+
+TASK_KINDS = ("pose", "position", "direction", "coordinate", "rotation")
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("kind", TASK_KINDS)
+def test_no_motion_that_does_the_tasks_costs_less(seed: int, kind: str) -> None:
+    """The tasks are what the tip does in a known motion, whose cost is an integral in closed form."""
+    machine, rng = random_chain(seed), np.random.default_rng([seed, TASK_KINDS.index(kind)])
+    low, high = machine.robot.lower, machine.robot.upper
+    n, horizon, middle = machine.joint_size, 2.0, (low + high) / 2
+    swing, weights = rng.uniform(-0.15, 0.15, n) * (high - low), rng.uniform(0.3, 2.0, n)
+
+    def tip(t: ca.SX) -> Any:
+        return machine.tip_pose((), middle + swing * ca.sin(2 * np.pi / horizon * t))
+
+    tracks: dict[str, dict[str, Any]] = {
+        "pose": {"position": lambda t: tip(t).position, "orientation": lambda t: tip(t).rotation},
+        "position": {"position": lambda t: tip(t).position},
+        "direction": {"position": lambda t: tip(t).position, "direction": lambda t: tip(t).rotation[:, 2]},
+        "coordinate": {"position": lambda t: tip(t).position, "rows": [4]},
+        "rotation": {"orientation": lambda t: tip(t).rotation},
+    }
+    task = TipTask(**tracks[kind], duration=horizon)
+    options = PlanOptions(search="global", cost=Cost(velocity=1.0, weights=weights))
+    least = tool_rate_bound(checked_request(machine, task, None, options))
+    cost = float(weights @ swing**2) / 2 * (2 * np.pi / horizon) ** 2 * horizon / 2
+    assert 0.0 <= least <= cost * (1 + 1e-9)
+
+
+def test_tasks_relative_to_a_link_bound_nothing() -> None:
+    machine = random_chain(0)
+    task = TipTask(position=[0.1, 0.0, 0.2], relative_to="a", duration=1.0)
+    assert tool_rate_bound(checked_request(machine, task, None, PlanOptions(search="global"))) == 0.0
+
+
+def test_with_parallel_rails_the_bound_of_motions_in_time_is_exact() -> None:
+    """Four rails share the motion in inverse proportion to their weights, and the plan costs what the bound says."""
+    names = ("first", "second", "third", "fourth")
+    joints = [
+        Joint(name, "prismatic", below, link, (0.0, 0.0, 0.1), axis=(1.0, 0.0, 0.0), lower=-2.0, upper=2.0)
+        for name, below, link in zip(names, ("base", "a", "b", "c"), ("a", "b", "c", "tool"), strict=True)
+    ]
+    machine = FixedBase(Robot(tuple(Link(name) for name in ("base", "a", "b", "c", "tool")), tuple(joints), "tool"))
+    weights, seconds = np.array([1.0, 2.0, 0.5, 4.0]), 2.0
+    task = TipTask(position=lambda t: ca.vertcat(0.3 * t, 0, 0.4), rows=[3], duration=seconds)
+    result = plan(machine, task, search="global", cost=Cost(velocity=1.0, weights=weights), scene=False)
+    assert isinstance(result, SolvedPlan)
+    assert result.bound is not None
+    exact = 0.3**2 * seconds / 2 / (1 / weights).sum()
+    assert result.cost == pytest.approx(exact, rel=1e-6)
+    assert result.bound == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.long
+def test_a_global_search_with_three_redundant_joints_has_a_bound_and_costs_no_more_than_others() -> None:
+    machine = FixedBase(panda_arm())
+    first = np.array(ca.DM(machine.tip_pose((), PANDA_START).position)).ravel()
+    task = TipTask(position=lambda t: ca.DM(first) + 0.1 * ca.vertcat(t, 0, -t), duration=1.0)
+    result, other = (plan(machine, task, search=each, scene=False) for each in ("global", "configurations"))
+    assert result.bound is not None
+    assert 0.0 < result.bound <= result.cost <= other.cost * (1 + 1e-6)
 
 
 @pytest.mark.long

@@ -212,7 +212,7 @@ def test_lower_bounds_of_a_step_are_below_it_and_tight(kind: Any, free: int) -> 
         if kind is not SquaredRates and free == 1:  # the grid is coarse in more dimensions
             assert value == pytest.approx(costs(place), abs=1e-3)
     near = somewhere()
-    lower = steps.lower(near, np.zeros((count, free)), np.zeros((count, free, free)))
+    lower = steps.descend(near, np.zeros((count, free)), np.zeros((count, free, free)))
     assert (steps.at(lower)[0] <= steps.at(near)[0] + 1e-9).all()
 
 
