@@ -184,10 +184,8 @@ def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, flo
     rows = np.arange(len(bases))
     for k in range(24):  # shrinking steps towards the farthest point: smallest circle (Badoiu & Clarkson 2003)
         farthest = rows, ((x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2).argmax(axis=1)
-        centre_x, centre_y = (
-            centre_x + (x[farthest] - centre_x) / (k + 4),
-            centre_y + (y[farthest] - centre_y) / (k + 4),
-        )
+        centre_x = centre_x + (x[farthest] - centre_x) / (k + 4)
+        centre_y = centre_y + (y[farthest] - centre_y) / (k + 4)
     distances = (x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2
     radius = np.sqrt(distances.max(axis=1)) * np.array(SETTINGS.radii)[:, None]
     caps = np.sqrt(np.maximum(radius[:, :, None] ** 2 - distances, 0))
@@ -287,8 +285,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
     low, high = [triangles[count == 3]], [triangles[count == 0]]
     for lone, one_side, other_side in ((below, low, high), (~below, high, low)):
         rows = np.flatnonzero(lone.sum(axis=1) == 1)
-        first = lone[rows].argmax(axis=1)
-        order = (first[:, None] + np.arange(3)) % 3
+        order = (lone[rows].argmax(axis=1)[:, None] + np.arange(3)) % 3
         corners = triangles[rows[:, None], order]
         height = heights[rows[:, None], order]
         a, b, c = (corners[:, k] for k in range(3))
