@@ -26,7 +26,6 @@ from models.errors import ModelError
 
 Expression = Any
 """A CasADi SX, MX or DM, anything that NumPy reads as an array of floats, or a (nested) list with CasADi entries."""
-
 FULL_TURN = 2 * np.pi
 """Angle of a full turn: 2 pi, rad."""
 

@@ -48,17 +48,14 @@ from models.spatial import FULL_TURN, Expression
 LIMIT_NAMES = tuple(f"joint {joint} {side}" for joint in range(1, 7) for side in ("lower", "upper"))
 ACTIVE = ("free", "pitch reach", "yaw reach", *LIMIT_NAMES, "clearance")
 """Names of the constraints that may be active at a roll angle, in the order of their codes."""
-
 STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits", "clearance")
 """Status of a target, in the order of the codes: "ok", or the reason why the target has no feasible roll angle."""
-
 ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
 """Distances inside a limit at which ends of roll intervals are placed, so that a strict limit check accepts the ends.
 
 ANGLE_INSET is in rad or m, REACH_INSET applies to a sine or cosine.
 """
-
 SQUARED_POLISH_STEP = 1e-5
 SINE_ROUNDING = 2e-15
 """Upper bound of the rounding error of sin q4."""

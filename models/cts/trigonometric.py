@@ -18,10 +18,8 @@ from models.spatial import Expression
 
 Point = tuple[Expression, Expression]
 """A point of the unit circle: (cosine, sine) of an angle."""
-
 Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 """A function of a point of the unit circle that returns a value and its derivative with respect to the angle."""
-
 SMALLEST_DIVISOR = 1e-300
 """Number added to divisors that may be zero; it is too small to change any other divisor."""
 

@@ -282,12 +282,7 @@ def _color(material: ElementTree.Element) -> Array | None:
 
 
 def _shape(
-    element: ElementTree.Element,
-    owner: str,
-    folder: str,
-    shape_type: type[_Shape],
-    omitted: list[str],
-    **arguments: Any,
+    element: ElementTree.Element, owner: str, folder: str, shape_type: type[_Shape], omitted: list[str], **options: Any
 ) -> list[_Shape]:
     """Return a list with the shape of a <collision> or <visual> element; it is empty if the shape has no volume."""
     shapes: list[Any] = list(child_of(element, "geometry", owner))
@@ -305,7 +300,7 @@ def _shape(
     empty = not size.all() and np.isfinite(size).all() and (kind == "mesh" or size.min() >= 0)
     checked_size = np.where(size == 0, 1.0, size) if empty else size  # so that all else is checked
     try:
-        result = shape_type(kind, checked_size, file, *origin_of(element, owner), folder if file else "", **arguments)
+        result = shape_type(kind, checked_size, file, *origin_of(element, owner), folder if file else "", **options)
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
     if empty:

@@ -273,9 +273,7 @@ class _PairClassifier:
                 self._by_hulls[key] = ALWAYS if (hulls.bounds(self.configurations)[0] <= 0).all() else None
         if (hull_reason := self._by_hulls[key]) is not None:
             return hull_reason, False
-        if reason == COVERED:
-            return None, not two_joints
-        return reason, False
+        return (None, not two_joints) if reason == COVERED else (reason, False)
 
     def _pair(self, first_link: str, first: Shape, second_link: str, second: Shape) -> _BodyPair:
         parts = self.parts

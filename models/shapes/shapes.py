@@ -309,7 +309,6 @@ class Mesh(Polytope):
 
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
-
 SHAPE_KINDS: tuple[type[Shape], ...] = get_args(Shape)
 
 

@@ -147,9 +147,7 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Horizontal ground with the lines of a square grid: height, m, middle (x, y), m, radius at which the ground fades
-    out, m, and grid spacing, m.
-    """
+    """Level ground with a square grid: height, middle (x, y), radius at which it fades out, and grid spacing, all m."""
 
     height: float
     middle: tuple[float, float]
