@@ -215,9 +215,8 @@ class FreeFloating:
         along = ca.vertcat(turning, joint_rates, accelerations)
         second = ca.mtimes(plane.T, ca.jtimes(twist, ca.vertcat(momentum, q, joint_rates), along))
         second = ca.mtimes(plane, second) + ca.vertcat(ca.DM(3, 1), cross(spin, twist[3:6]))
-        torques = inverse_dynamics(
-            self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_motion=(twist, second)
-        )  # fmt: skip
+        zero = (0.0, 0.0, 0.0)
+        torques = inverse_dynamics(self.robot, q, joint_rates, accelerations, gravity=zero, base_motion=(twist, second))
         if carried is None:
             return torques
         values = ca.SX(ca.vertcat(*(self._momentum_in_base(base) or ())))
@@ -245,8 +244,7 @@ class FreeFloating:
         turn = self.world_from_base(base).rotation
         frames, axes = frames_and_axes(self.robot, q)
         tip = tip_frame(self.robot, frames).position
-        tip_from_base: Expression = ca.mtimes(turn, tip)
-        lever = motion_transform((ca.DM.eye(3), -tip_from_base))
+        lever = motion_transform((ca.DM.eye(3), -ca.mtimes(turn, tip)))
         joints = point_jacobian(self.robot, axes, self.robot.tip_link, tip)
         both = motion_transform((turn, ca.DM(3, 1)))
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))

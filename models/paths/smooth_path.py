@@ -216,8 +216,7 @@ class SmoothPath:
         order = np.argsort(starts, kind="stable")
         starts, lengths, counts = starts[order], lengths[order], counts[order]
         step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        inside = np.repeat(starts, counts) + np.repeat(lengths / counts, counts) * step
-        return np.append(inside, self.length)
+        return np.append(np.repeat(starts, counts) + np.repeat(lengths / counts, counts) * step, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
         """Return the speed, (P,), on every segment and blend, given the speeds on the segments.

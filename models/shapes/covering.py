@@ -131,8 +131,7 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
     """Return the distances by which points lie outside a capsule or box, zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
-    own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
-    return np.asarray(own.max(axis=1))
+    return np.asarray((np.abs((points - shape.position) @ shape.rotation) - shape.size / 2).max(axis=1))
 
 
 def _fit_capsule(points: Array) -> Capsule:
@@ -396,8 +395,7 @@ def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
 
 def _to_json(each: Cover) -> dict[str, Any]:
     names = ("radius", "start", "end") if isinstance(each.shape, Capsule) else ("size", "position", "rotation")
-    entries = {name: np.asarray(getattr(each.shape, name)).tolist() for name in names}
-    return entries | {"overhang": each.overhang}
+    return {name: np.asarray(getattr(each.shape, name)).tolist() for name in names} | {"overhang": each.overhang}
 
 
 def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:

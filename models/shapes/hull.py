@@ -108,8 +108,7 @@ def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
     first = np.unique(same, return_index=True)[1]
-    order = np.argsort(np.argsort(first))
-    return np.sort(first), order[same]
+    return np.sort(first), np.argsort(np.argsort(first))[same]
 
 
 def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -125,8 +125,7 @@ class PiecewisePolynomial:
     def derivative(self) -> PiecewisePolynomial:
         """Return the time derivative of the piecewise polynomials."""
         degree = self.coefficients.shape[1] - 1
-        width = np.diff(self.t)[:, None, None]
-        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
+        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / np.diff(self.t)[:, None, None])
 
     def at(self, times: Array) -> Array:
         """Return values (M, n) at times (M,), clipped to the range of `t`; a break belongs to the later interval."""
