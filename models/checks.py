@@ -238,9 +238,8 @@ class Checks:
                 raise self._wrong(label, f"{_description(array, wrong)} is not finite", array)
         if sign != "any" and (wrong := array < 0 if sign == "nonnegative" else ~(array > 0)).any():
             words = f"{_description(array, wrong)} {unit}".rstrip()
-            raise self._wrong(
-                label, f"{words} is {'negative' if sign == 'nonnegative' else 'not positive'}", array, 0.0
-            )
+            fault = "negative" if sign == "nonnegative" else "not positive"
+            raise self._wrong(label, f"{words} is {fault}", array, 0.0)
         return freeze(array)
 
     def broadcast(
@@ -283,8 +282,7 @@ class Checks:
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
         if error > 1e-6 or a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
-            words = f"{matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)"
-            raise self._wrong(label, words, matrix)
+            raise self._wrong(label, f"{matrix.tolist()} is not a rotation matrix (orthonormal, determinant 1)", matrix)
         if error > 1e-12:
             left, _, right = np.linalg.svd(matrix)
             matrix = freeze(left @ right)

@@ -28,8 +28,7 @@ def paper_example() -> FreeFloating:
     tip moves at (-1, -1) m/s with free orientation.
     """
     base = Link("base", 100.0, inertia=np.diag([33.335, 33.335, 66.67]))
-    robot = planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base)
-    return FreeFloating(robot, base="planar")
+    return FreeFloating(planar_chain([2.0] * 3, [2.0] * 3, [0.7083] * 3, mount=(1.0, 0.0), base=base), base="planar")
 
 
 STANDING_STARTS = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
@@ -47,9 +46,8 @@ def standing_example() -> Standing:
     """
     robot = planar_chain((0.44, 0.44, 0.52, 0.26, 0.18), (6.02, 14.0, 35.0, 3.92, 2.38))
     limits = np.deg2rad([(30, 120), (0, 165), (190, 360), (135, 360), (0, 150)])
-    joints = tuple(
-        replace(joint, lower=lower, upper=upper) for joint, (lower, upper) in zip(robot.joints, limits, strict=True)
-    )
+    ranges = zip(robot.joints, limits, strict=True)
+    joints = tuple(replace(joint, lower=lower, upper=upper) for joint, (lower, upper) in ranges)
     return Standing(
         replace(robot, joints=joints),
         rotation=[(0, 0, 1), (1, 0, 0), (0, 1, 0)],  # the chain's x, y, z become the world's y, z, x
@@ -129,6 +127,5 @@ def _cylinder(name: str, axis: Any, begin: float, end: float, radius: float, mas
     transverse, axial = mass * (3 * radius**2 + (end - begin) ** 2) / 12, mass * radius**2 / 2
     middle = (begin + end) / 2 * axis
     shape = CollisionShape("cylinder", (radius, end - begin), translation=middle, rotation=ALONG[id(axis)])
-    return Link(
-        name, mass, middle, transverse * np.eye(3) + (axial - transverse) * np.outer(axis, axis), collisions=(shape,)
-    )
+    inertia = transverse * np.eye(3) + (axial - transverse) * np.outer(axis, axis)
+    return Link(name, mass, middle, inertia, collisions=(shape,))

@@ -143,9 +143,7 @@ def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTre
         ValueError, LookupError: It declares entities, has too many elements and attributes, or its encoding is
             unknown.
     """
-    content = (
-        data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")
-    )  # NUL bytes of UTF-16
+    content = data.encode(errors="surrogatepass") if isinstance(data, str) else data.replace(b"\0", b"")  # of UTF-16
     if b"<!ENTITY" in content:
         raise ValueError("it declares entities, which are not read")
     count = content.count(b"<") - content.count(b"</") + content.count(b"=")
@@ -257,8 +255,7 @@ def cache_folder() -> Path:
 
 
 def private_folder(make: bool = False) -> Path:
-    """Return the folder of cached results, created if `make`, after checking that only this user can change its
-    contents.
+    """Return the folder of cached results, created if `make`, after checking that only this user can change it.
 
     Raises:
         OSError: There is no folder, it is a link, or another user may change it or a folder above it.

@@ -26,7 +26,6 @@ from models.errors import ModelError
 
 Expression = Any
 """A CasADi SX, MX or DM, anything that NumPy reads as an array of floats, or a (nested) list with CasADi entries."""
-
 FULL_TURN = 2 * np.pi
 """Angle of a full turn: 2 pi, rad."""
 
@@ -227,15 +226,13 @@ def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -
 def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
     """Return the matrix that transforms twists from frame B to frame A, given the pose of B in A. Shape (6, 6)."""
     turn, position = expression(frame[0]), expression(frame[1])
-    zero = type(turn)(3, 3)
-    return ca.vertcat(ca.horzcat(turn, zero), ca.horzcat(ca.mtimes(skew(position), turn), turn))
+    return ca.vertcat(ca.horzcat(turn, type(turn)(3, 3)), ca.horzcat(ca.mtimes(skew(position), turn), turn))
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
     """Return the matrix, (6, 6), that transforms wrenches or momenta from frame B to A, given the pose of B in A."""
     turn, position = expression(frame[0]), expression(frame[1])
-    zero = type(turn)(3, 3)
-    return ca.vertcat(ca.horzcat(turn, ca.mtimes(skew(position), turn)), ca.horzcat(zero, turn))
+    return ca.vertcat(ca.horzcat(turn, ca.mtimes(skew(position), turn)), ca.horzcat(type(turn)(3, 3), turn))
 
 
 @on_scalars
@@ -267,8 +264,7 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
 
 @on_scalars
 def determinant(matrix: Expression) -> Expression:
-    """Return the determinant, (1, 1), of a small square matrix (n <= 7) without divisions, so that zero pivots give no
-    nan.
+    """Return the determinant, (1, 1), of a small square matrix (n <= 7), without divisions, which zero pivots forbid.
 
     Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
     """
@@ -287,11 +283,7 @@ def determinant(matrix: Expression) -> Expression:
 
 
 LINEAR = re.compile(r"casadi_interpn\(res\[0\], 1, (\w+), \w+, (\w+), arg\[0\]")
-
-
 SPLINE = re.compile(r"nd_boor_eval\)?\([^;]*?,1,(\w+),\w+,(\w+),\w+,(\w+),")
-
-
 NUMBERS = re.compile(r"static const casadi_(?:real|int) (\w+)\[\d+\] =\s*\{([^}]*)\}")
 
 
@@ -322,9 +314,7 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Return the outputs of a table (CasADi interpolant) as piecewise polynomials, read from the C code generated for
-    it.
-    """
+    """Return the outputs of a table (CasADi interpolant) as piecewise polynomials, read from its generated C code."""
     code = ca.CodeGenerator("table")
     code.add(function)
     text = code.dump()
@@ -340,9 +330,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
         knots = np.concatenate([knots[:1], knots, knots[-1:]])
     curve = scipy.interpolate.BSpline(knots, values.reshape(len(knots) - order - 1, -1), order)
     breaks = np.unique(knots)
-    coefficients = np.array(
-        [curve.derivative(k)(breaks[:-1]) / factorial(k) if k else curve(breaks[:-1]) for k in range(order + 1)]
-    )
+    coefficients = np.array([curve(breaks[:-1], k) / factorial(k) for k in range(order + 1)])
     x = ca.SX.sym("x")
     table = ca.Function("table", [x], [_polynomials(breaks, coefficients, x, beyond=bool(linear))])
     samples = np.concatenate([breaks, (breaks[1:] + breaks[:-1]) / 2, breaks[:1] - 1.0, breaks[-1:] + 1.0])[None]
@@ -354,9 +342,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial of x without branches; beyond its breakpoints it continues if `beyond`, else it is
-    zero.
-    """
+    """Return a piecewise polynomial of x without branches; beyond its breaks it continues if `beyond`, else is zero."""
     last = len(breaks) - 2
     total = ca.SX(ca.DM(coefficients[0, 0]))
     for k in range(last + 1):

@@ -28,6 +28,7 @@ from models.checks import require
 from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import (
     Candidate,
+    chart_residual,
     check_constraints,
     checked_gain,
     closed_form_ends,
@@ -38,7 +39,6 @@ from models.cts.roll import (
     level_points,
     limit_code,
     polish_to_level,
-    polish_to_value,
     slide_points,
     unwrap_roll,
     yaw_chart,
@@ -276,9 +276,8 @@ class Search:
         first = ca.SX.sym("best", INCUMBENT_SIZE)
         ends = closed_form_ends(self.rig, target, self.branch)
         best, evaluations, _ = self._compare(target, previous, ends, _record(Incumbent, first))
-        return ca.Function(
-            "simple", [target, previous, first], ca.cse([ca.vertcat(*best), stack(Evaluation, evaluations)])
-        )
+        outputs = ca.cse([ca.vertcat(*best), stack(Evaluation, evaluations)])
+        return ca.Function("simple", [target, previous, first], outputs)
 
     def _rough_stationary(self) -> Any:
         """Return the CasADi Function that approximates the roll angles at which the rig's cost index is stationary.
@@ -354,7 +353,7 @@ class Search:
         near_limit = ca.Function("rough", [target, points], ca.cse([stack(RoughRoll, ends)]))
 
         def polished(at: Expression, end: RoughRoll) -> Point:
-            return polish_to_value(chart, at, 2, value=end.value, point=(end.c, end.s))
+            return polish((end.c, end.s), chart_residual(chart, at, 2, end.value))
 
         x, before = _inputs(ca.MX)
         best = ca.MX.sym("best", INCUMBENT_SIZE)
@@ -471,8 +470,7 @@ class Search:
 
 def _is_finite(target: Expression, previous: Expression) -> Expression:
     """Return whether all entries of the target and the previous roll angle are finite."""
-    total = ca.sum1(target) + previous
-    return ca.fabs(total) < ca.inf
+    return ca.fabs(ca.sum1(target) + previous) < ca.inf
 
 
 def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:

@@ -143,21 +143,12 @@ def clearances(
         for label, obstacle in obstacles.items():
             distances[name, label] = pair_function(Capsule, type(obstacle))(own, column(obstacle))
     if not distances:
-        message = "clearances: the scene is empty; give walls, solids or capsules"
-        raise ModelError(message, name="scene", value=scene)
+        raise ModelError("clearances: the scene is empty; give walls, solids or capsules", name="scene", value=scene)
     return distances
 
 
 def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return a cost term that grows as the gap between rig and obstacles closes: weight exp(-gap / width).
-
-    The gap and the width are in m.
-
-    Raises:
-        ModelError: The weight is negative or not finite, or the width is not positive.
-    """
-    require.nonnegative("clearance: weight", weight)
-    require.positive("clearance: width", width, unit="m")
+    """Return the cost weight exp(-gap / width), which grows as the gap (m) between rig and obstacles closes."""
     return weight * ca.exp(-gap / width)
 
 
@@ -237,8 +228,7 @@ def collision_free_inverse(
     inputs = [target, previous, angle]
     value = ca.Function("value", inputs, ca.cse([ca.if_else(feasible, cost, ca.inf)]))
     short: Any = ca.fmax(clearance + SEARCH.inset - gap, 0) if np.isfinite(clearance) else 0.0
-    penalised = ca.if_else(within_limits, cost + SEARCH.penalty * short, ca.inf)
-    merit = ca.Function("merit", inputs, ca.cse([penalised]))
+    merit = ca.Function("merit", inputs, ca.cse([ca.if_else(within_limits, cost + SEARCH.penalty * short, ca.inf)]))
     joints_and_gap = ca.Function("joints_and_gap", inputs, ca.cse([joints, gap]))
 
     x, before = ca.MX.sym("target", 5), ca.MX.sym("previous")

@@ -205,8 +205,7 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
     The target coordinates are (x, y, z, yaw, pitch). Shape (5, 6).
     """
     joints = ca.SX.sym("q", 6)
-    jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
-    return jacobian(q)
+    return ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])(q)
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
@@ -232,8 +231,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     c_pitch, s_pitch = ca.cos(target[4]), ca.sin(target[4])
     axle = target[:3] - rig.sting * ca.vertcat(c_yaw * c_pitch, s_yaw * c_pitch, -s_pitch)
-    zero = target[0] * 0
-    return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, zero)
+    return axle, ca.vertcat(c_yaw * s_pitch, s_yaw * s_pitch, c_pitch), ca.vertcat(s_yaw, -c_yaw, target[0] * 0)
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:

@@ -48,17 +48,14 @@ from models.spatial import FULL_TURN, Expression
 LIMIT_NAMES = tuple(f"joint {joint} {side}" for joint in range(1, 7) for side in ("lower", "upper"))
 ACTIVE = ("free", "pitch reach", "yaw reach", *LIMIT_NAMES, "clearance")
 """Names of the constraints that may be active at a roll angle, in the order of their codes."""
-
 STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits", "clearance")
 """Status of a target, in the order of the codes: "ok", or the reason why the target has no feasible roll angle."""
-
 ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
 """Distances inside a limit at which ends of roll intervals are placed, so that a strict limit check accepts the ends.
 
 ANGLE_INSET is in rad or m, REACH_INSET applies to a sine or cosine.
 """
-
 SQUARED_POLISH_STEP = 1e-5
 SINE_ROUNDING = 2e-15
 """Upper bound of the rounding error of sin q4."""
@@ -149,8 +146,7 @@ def check_constraints(
     angles: dict[bool, Expression] = {False: 1, True: 1}
     for joint, (sine, cosine) in pairs.items():
         if rig.limited(joint):
-            inside = _within(rig, joint, sine, cosine, 0.0)
-            angles[joint > 3] = ca.logic_and(angles[joint > 3], inside)
+            angles[joint > 3] = ca.logic_and(angles[joint > 3], _within(rig, joint, sine, cosine, 0.0))
     low, high = rig.limit(1, False), rig.limit(1, True)
     slide = p.q1 >= low if np.isfinite(low) else 1, p.q1 <= high if np.isfinite(high) else 1
     return ConstraintCheck(ca.fabs(p.sin4) <= 1, ca.fabs(p.cos2) <= 1, angles[True], angles[False], *slide)
@@ -177,11 +173,8 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     for level in yaw_levels(rig, target, branch):
         for point in level_points(rig, target, level.cosine):
             above = 1 if level.above else -1
-            ends.append(
-                Candidate(
-                    *polish_to_level(rig, chart, target, value=level.cosine, above=above, point=point), level.code
-                )
-            )
+            end = polish_to_level(rig, chart, target, value=level.cosine, above=above, point=point)
+            ends.append(Candidate(*end, level.code))
     return ends
 
 
@@ -310,18 +303,13 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
     return ca.Function("chart", [t, c, s], [values[0], slope[0], values[1], slope[1], configuration.cos4])
 
 
-def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll angle at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
-    return polish(point, chart_residual(chart, target, output, value))
-
-
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
     """Return the roll angle at which cos q2 (angle of joint 2) equals a limit, on the feasible side despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
     """
-    c, s = polish_to_value(chart, target, 0, value=value, point=point)
+    c, s = polish(point, chart_residual(chart, target, 0, value))
     cos4 = ca.fabs(chart(target, c, s)[4])
     margin = SINE_ROUNDING * rig.pitch_link / rig.yaw_link_1 / (cos4 + 1e-8)
     return polish((c, s), chart_residual(chart, target, 0, value + above * margin), steps=1)
@@ -376,9 +364,8 @@ def slide_points(rig: Rig, upper: bool) -> Any:
     y = first(axle[1] - rig.yaw_link_2 * s_yaw - rig.yaw_offset * c_yaw, 1)
     height = multiply_series(first(axle[2], 2), first(axle[2], 2))
     stretched = add_series([(rig.pitch_link**2, 0.0)], height, -1)
-    known = add_series(
-        add_series(multiply_series(x, x), multiply_series(y, y)), add_series(stretched, [(rig.yaw_link_1**2, 0.0)], -1)
-    )
+    square = add_series(multiply_series(x, x), multiply_series(y, y))
+    known = add_series(square, add_series(stretched, [(rig.yaw_link_1**2, 0.0)], -1))
     along = add_series([(c_yaw * a, c_yaw * b) for a, b in x], [(s_yaw * a, s_yaw * b) for a, b in y])
     f = add_series(multiply_series(known, known), multiply_series(stretched, multiply_series(along, along)), -4)
     outputs = ca.cse([ca.vertcat(ca.horzcat(*[a for a, _ in f]), ca.horzcat(*[b for _, b in f]))])

@@ -103,9 +103,7 @@ def solve_table(
     if avoidance is None:
         functions = [optimal_inverse(rig, tunnel, branch, rate_weight=rate_weight) for branch in branches]
     else:
-        functions = [
-            collision_free_inverse(rig, tunnel, avoidance, branch, rate_weight=rate_weight) for branch in branches
-        ]
+        functions = [collision_free_inverse(rig, tunnel, avoidance, each, rate_weight=rate_weight) for each in branches]
     if in_sequence:
         roll, results = float(before[0]), []
         for row in rows:
@@ -136,9 +134,7 @@ def _best_branch(results: list[Any]) -> Array:
             continue
         solved, best_solved = rows[:, 9] == 0, best[:, 9] == 0
         better = solved & (~best_solved | (rows[:, 6] < best[:, 6] - 1e-12))
-        further = (
-            ~solved & ~best_solved & (rows[:, 9] > best[:, 9])
-        )  # the branch that satisfies most tests names the reason
+        further = ~solved & ~best_solved & (rows[:, 9] > best[:, 9])  # most satisfied tests: names the reason
         best = np.where((better | further)[:, None], rows, best)
     assert best is not None
     return best

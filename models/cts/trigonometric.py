@@ -18,10 +18,8 @@ from models.spatial import Expression
 
 Point = tuple[Expression, Expression]
 """A point of the unit circle: (cosine, sine) of an angle."""
-
 Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 """A function of a point of the unit circle that returns a value and its derivative with respect to the angle."""
-
 SMALLEST_DIVISOR = 1e-300
 """Number added to divisors that may be zero; it is too small to change any other divisor."""
 
@@ -81,8 +79,7 @@ class Harmonics(NamedTuple):
 
 def square_of_first_harmonic(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
     """Return the square of a trigonometric polynomial of one harmonic, a0 + a1 cos x + b1 sin x."""
-    mean = a0 * a0 + (a1 * a1 + b1 * b1) / 2
-    return Harmonics(mean, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
+    return Harmonics(a0 * a0 + (a1 * a1 + b1 * b1) / 2, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
 
 
 def subtract_harmonics(f: Harmonics, g: Harmonics) -> Harmonics:
@@ -105,7 +102,6 @@ def roots(f: Harmonics, steps: int = ROOTS.polish_steps) -> list[Point]:
     of the lines, typically the square root of the machine precision.
 
     Args:
-        f: The trigonometric polynomial.
         steps: Newton steps of the polish; without any, simple roots are accurate to about 1e-6.
     """
     size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + SMALLEST_DIVISOR
@@ -316,8 +312,7 @@ def series_roots(degree: int) -> Any:
                 repulsion = (repulsion[0] + inverse_differences[i, k][0], repulsion[1] + inverse_differences[i, k][1])
         correction = _multiply(newton, repulsion)
         step = _divide(newton, (1 - correction[0], -correction[1]))
-        length = ca.hypot(step[0], step[1])
-        damping = 1 / ca.fmax(1.0, length / (2 * (1 + ca.hypot(x, y))))
+        damping = 1 / ca.fmax(1.0, ca.hypot(step[0], step[1]) / (2 * (1 + ca.hypot(x, y))))
         iterates.append(ca.vertcat(x - damping * step[0], y - damping * step[1]))
     longest = ca.SX(0)
     for i in range(n):
@@ -325,9 +320,8 @@ def series_roots(degree: int) -> Any:
     step_function = ca.Function("aberth", [z, unit], [ca.horzcat(*iterates), longest])
 
     symbol = ca.MX.sym("coefficients", 2, degree + 1)
-    norm = ca.Function("norm", [coefficients], [coefficients / (ca.norm_1(ca.vec(coefficients)) + SMALLEST_DIVISOR)])(
-        symbol
-    )
+    size = ca.norm_1(ca.vec(coefficients)) + SMALLEST_DIVISOR
+    norm = ca.Function("norm", [coefficients], [coefficients / size])(symbol)
     angles = [0.37 + 2 * ca.pi * i / n for i in range(n)]
     # off the circle the roots are in pairs z, 1 / conj z: one half starts inside, the other outside
     radii = [3.0 if i % 2 else 1 / 3.0 for i in range(n)]

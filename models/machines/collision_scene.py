@@ -249,8 +249,7 @@ class CollisionScene:
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
         """Return rotation and position of all F frames of links and moving obstacles as one column. Shape (12 F, 1)."""
-        frames = self._frames(base, q, time)
-        columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
+        columns = [part for frame in self._frames(base, q, time) for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
 
     def distances(
@@ -422,15 +421,11 @@ def _checked_list(values: Any, argument: str) -> tuple[Any, ...]:
 def _pair(value: Any, number: int) -> tuple[str, str]:
     if isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(name, str) for name in value):
         return value[0], value[1]
-    message = f"scene: ignored[{number}] must be two names, not {value!r}"
-    raise ModelError(message, name="ignored", value=value)
+    raise ModelError(f"scene: ignored[{number}] must be two names, not {value!r}", name="ignored", value=value)
 
 
 def _distance_gradients(scene: CollisionScene, groups: Sequence[Sequence[tuple[int, int]]], rounding: float) -> Any:
-    """Return the CasADi Function that computes the least distance in each group of body pairs, and its gradient.
-
-    Each distance is the minimum over one group.
-    """
+    """Return the CasADi Function that computes the least distance in each group of body pairs, and its gradient."""
     machine, bodies = scene.machine, scene.bodies
     base, q, time = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("time")
     world_from_base = machine.world_from_base(base)

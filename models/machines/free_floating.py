@@ -144,8 +144,7 @@ class FreeFloating:
 
         Equation (24) of Kim and Kim (2011): E1^-1 (momentum - E2 joint_rates) with the `momentum_matrices` E1, E2.
         """
-        rates = joint_vector(self.robot, joint_rates, "joint_rates")
-        reaction = self._reaction(q, rates, self._momentum_in_base(base))
+        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
         twist = ca.vertcat(ca.mtimes(turn, reaction.base_angular), ca.mtimes(turn, reaction.base_linear))
         return ca.densify(twist)[self.twist_rows, :]
@@ -157,8 +156,7 @@ class FreeFloating:
             twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
         pose = self._checked_base(base)
-        rates = joint_vector(self.robot, joint_rates, "joint_rates")
-        reaction = self._reaction(q, rates, self._momentum_in_base(base))
+        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
         quaternion, spin = pose[3:7], reaction.base_angular
         turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # spin is in base axes
@@ -201,8 +199,7 @@ class FreeFloating:
     def joint_torques(
         self, base: Expression, q: Expression, joint_rates: Expression, accelerations: Expression
     ) -> Expression:
-        """Return the joint torques (forces of prismatic joints) of a motion without external wrenches. Shape (n, 1), N
-        m or N.
+        """Return the joint torques (or forces) of a motion without external wrenches. Shape (n, 1), N m or N.
 
         They are computed in base axes. The pose of the base enters only through the conserved momentum h, whose
         components change as these axes rotate with the angular velocity w: h' = -w x h. The arguments are symbols,
@@ -218,9 +215,8 @@ class FreeFloating:
         along = ca.vertcat(turning, joint_rates, accelerations)
         second = ca.mtimes(plane.T, ca.jtimes(twist, ca.vertcat(momentum, q, joint_rates), along))
         second = ca.mtimes(plane, second) + ca.vertcat(ca.DM(3, 1), cross(spin, twist[3:6]))
-        torques = inverse_dynamics(
-            self.robot, q, joint_rates, accelerations, gravity=(0.0, 0.0, 0.0), base_motion=(twist, second)
-        )  # fmt: skip
+        zero = (0.0, 0.0, 0.0)
+        torques = inverse_dynamics(self.robot, q, joint_rates, accelerations, gravity=zero, base_motion=(twist, second))
         if carried is None:
             return torques
         values = ca.SX(ca.vertcat(*(self._momentum_in_base(base) or ())))
@@ -248,8 +244,7 @@ class FreeFloating:
         turn = self.world_from_base(base).rotation
         frames, axes = frames_and_axes(self.robot, q)
         tip = tip_frame(self.robot, frames).position
-        tip_from_base: Expression = ca.mtimes(turn, tip)
-        lever = motion_transform((ca.DM.eye(3), -tip_from_base))
+        lever = motion_transform((ca.DM.eye(3), -ca.mtimes(turn, tip)))
         joints = point_jacobian(self.robot, axes, self.robot.tip_link, tip)
         both = motion_transform((turn, ca.DM(3, 1)))
         return ca.densify(lever)[:, self.twist_rows], ca.densify(ca.mtimes(both, joints))
@@ -269,9 +264,7 @@ class FreeFloating:
         return checked_vector("base", base, self.base_size, meaning)
 
     def _spatial_momentum(self) -> tuple[Expression, Expression] | None:
-        """Return the conserved momentum, (angular about the centre of mass, linear), in world axes, or None if it is
-        zero.
-        """
+        """Return the conserved momentum (angular about the centre of mass, linear) in world axes, or None if zero."""
         momentum = np.asarray(self.conserved_momentum)
         if not momentum.any():
             return None

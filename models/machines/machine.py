@@ -195,9 +195,7 @@ def _with_robot(machine: Machine) -> Any:
 
 
 def base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Return the base's twist (angular, linear at the world's origin) per unit rate of each of its coordinates. Shape
-    (6, size).
-    """
+    """Return the base's twist (angular, linear at the world's origin) per unit rate of each coordinate, (6, size)."""
     orientation, position = (ca.SX(part) for part in world_from_base)
     twists = []
     for k in range(base.numel()):

@@ -172,8 +172,7 @@ class Scara:
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
         pose = inputs[0] + at * (inputs[1] + at * (inputs[2] / 2 + at * inputs[3] / 6))
-        joints = self.inverse_expression(pose, elbow)
-        outputs = [joints]
+        outputs = [self.inverse_expression(pose, elbow)]
         for _ in range(3):
             outputs.append(ca.jacobian(outputs[-1], at))
         here = ca.substitute(outputs, [at], [ca.SX(0)])
@@ -234,7 +233,6 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
     """Compute the joint positions of a SCARA arm along a path of its tool, keeping the elbow on one side.
 
     Args:
-        scara: The arm.
         path: Path of the tool, which may rotate about the vertical only.
         elbow: "left" or "right".
         clearance: Least distance (m) from a stretched and a folded arm, where the joint rates are unbounded.
@@ -249,8 +247,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
     _check_reach(scara, path, clearance)
     rates = scara.inverse_rates(elbow)
     s = path.sample_distances(8, 16)
-    turn = path.turn(s)
-    tilt = np.abs(turn.quaternion[:, 1:3]).max(axis=1)
+    tilt = np.abs(path.turn(s).quaternion[:, 1:3]).max(axis=1)
     if tilt.max() > 1e-9:
         at = s[int(tilt.argmax())]
         message = f"scara: the path tilts its tool at {at:g} m, a SCARA turns it about the vertical only"
@@ -341,8 +338,7 @@ def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: 
         peak = refined.argmax(axis=1)
         row = np.arange(len(peak))
         k = int(refined[row, peak].argmax())
-        best = max(
-            best, (float(points[k, peak[k]]), float(sign * refined[k, peak[k]])), key=lambda pair: sign * pair[1]
-        )
+        refined_peak = float(points[k, peak[k]]), float(sign * refined[k, peak[k]])
+        best = max(best, refined_peak, key=lambda pair: sign * pair[1])
         low, high = points[row, np.maximum(peak - 1, 0)], points[row, np.minimum(peak + 1, 16)]
     return best

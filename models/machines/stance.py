@@ -63,7 +63,6 @@ class Foot:
 
         Args:
             robot: Robot with the link and its shapes.
-            link: Name of the link.
             rotation: Axes of the link's frame, as columns, where the sole is level, z upwards; the identity if None.
         """
         ground = footprint(subtree(robot, link), rotation=rotation, links=[link])
@@ -223,8 +222,7 @@ class Stance(FixedBase):
             load = checked_vector(f"load of {name!r}", load, 6, "moment about the sole's origin and force")
             foot = self.feet[name]
             wrenches.append(Wrench(foot.link, load[3:], load[:3], foot.translation))
-        gravity = (0.0, 0.0, -self.gravity)
-        return {"wrenches": wrenches, "gravity": gravity, "world_from_base": self.world_from_base()}
+        return {"wrenches": wrenches, "gravity": (0.0, 0.0, -self.gravity), "world_from_base": self.world_from_base()}
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
@@ -241,9 +239,8 @@ class Stance(FixedBase):
             if name == next(iter(self.footholds)):
                 continue
             q = ca.SX.sym("q", self.joint_size)
-            matrix = frame_jacobian(
-                self.bodies, q, foot.link, point=foot.translation, world_from_base=self.world_from_base()
-            )
+            place = self.world_from_base()
+            matrix = frame_jacobian(self.bodies, q, foot.link, point=foot.translation, world_from_base=place)
             function = ca.Function("jacobian", [q], [matrix])
             jacobians = [np.array(function(rng.normal(size=self.joint_size))) for _ in range(SAMPLES)]
             magnitudes = np.max([np.abs(sample).max(axis=1) for sample in jacobians], axis=0)
@@ -285,9 +282,8 @@ class Stance(FixedBase):
             return ca.DM(0, 1)
         moment, force = self.load_in_sole(name, load)
         offsets = (sole.normals * sole.vertices).sum(axis=1) + margin
-        rows = (
-            ca.mtimes(ca.sparsify(ca.DM(sole.normals)), ca.vertcat(-moment[1], moment[0])) - ca.DM(offsets) * force[2]
-        )
+        arm = ca.vertcat(-moment[1], moment[0])  # center of pressure times pressure
+        rows = ca.mtimes(ca.sparsify(ca.DM(sole.normals)), arm) - ca.DM(offsets) * force[2]
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
@@ -316,8 +312,7 @@ class Stance(FixedBase):
                 rows = rng.normal(size=len(self.load_rows[name]))
                 loads[name] = ca.DM(self.full_load(name, rows)) + ca.DM([0, 0, 0, 0, 0, 10])
             q, qd, qdd = rng.normal(size=(3, self.joint_size))
-            values = self.loads(q, qd, qdd, loads)
-            for name, load in values.items():
+            for name, load in self.loads(q, qd, qdd, loads).items():
                 moment, force = (np.array(ca.DM(rows)).ravel() for rows in self.load_in_sole(name, load))
                 points_by_foot[name].append(np.array([-moment[1], moment[0]]) / force[2])
         return {name: np.array(points) for name, points in points_by_foot.items()}
@@ -350,9 +345,7 @@ class Stance(FixedBase):
         return Support(convex_hull(np.vstack(points)))
 
     def zero_moment_point(self, loads: Mapping[str, Expression]) -> Expression:
-        """Return the zero moment point in the horizontal plane of the first foothold: the loads have no horizontal
-        moment about it. Shape (2, 1), m.
-        """
+        """Return the zero moment point of the loads in the horizontal plane of the first foothold. Shape (2, 1), m."""
         moment, force = ca.DM(3, 1), ca.DM(3, 1)
         positions = [np.asarray(self.footholds[name].position) for name in loads]
         for position, load in zip(positions, loads.values(), strict=True):

@@ -37,9 +37,7 @@ External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return the external wrenches at a time and tip position; raise ModelError unless `external` is None or a
-    function.
-    """
+    """Return wrenches of `external` at a time and tip position; raise ModelError unless it is a function or None."""
     if external is None:
         return ()
     if not callable(external):
@@ -95,13 +93,11 @@ class Standing(FixedBase):
             raise ModelError(message, name="support", value=self.support)
         if self.robot.total_mass == 0:
             raise massless_error("nothing presses its foot on the ground")
-        gravity = require.positive(f"{owner}: gravity", self.gravity, unit="m/s^2")
-        set_fields(self, gravity=gravity)
+        set_fields(self, gravity=require.positive(f"{owner}: gravity", self.gravity, unit="m/s^2"))
         point = self.support.center if self.most_stable_point is None else self.most_stable_point
         widths = self.support.half_widths if self.half_widths is None else self.half_widths
         set_fields(self, most_stable_point=require.array(f"{owner}: most_stable_point", point, (2,)))
-        widths = require.array(f"{owner}: half_widths", widths, (2,), sign="positive", unit="m")
-        set_fields(self, half_widths=widths)
+        set_fields(self, half_widths=require.array(f"{owner}: half_widths", widths, (2,), sign="positive", unit="m"))
 
     @property
     def weight(self) -> float:
@@ -337,10 +333,8 @@ def standing_motion(
     """Compute joint torques, ground reaction and stability of a standing machine from samples of its motion.
 
     Args:
-        machine: Standing machine.
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
-        external: External wrenches.
         rows: Task of the reported manipulability.
 
     Raises:

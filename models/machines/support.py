@@ -47,9 +47,8 @@ class Support:
         lengths = np.linalg.norm(edges, axis=1)
         if lengths.min() <= ROUNDING * size:
             repeated = corners[lengths.argmin()].tolist()
-            raise ModelError(
-                f"support: corner {repeated} occurs twice in a row; give it once", name="vertices", value=repeated
-            )
+            message = f"support: corner {repeated} occurs twice in a row; give it once"
+            raise ModelError(message, name="vertices", value=repeated)
         next_edges = np.roll(edges, -1, axis=0)
         angles = np.arctan2(_cross(edges, next_edges), (edges * next_edges).sum(axis=1))
         reflex = int(angles.argmin())
@@ -103,8 +102,7 @@ class Support:
     def distances(self, point: Expression) -> Expression:
         """Return the signed distance of a point from each polygon edge's line, positive inside. Shape (k, 1), m."""
         point = checked_vector("point", point, 2, "x and y on the ground")
-        offsets = (self.normals * self.vertices).sum(axis=1)
-        return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
+        return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM((self.normals * self.vertices).sum(axis=1))
 
     def margin(self, point: Expression) -> Expression:
         """Return the least signed distance of a point from the lines of the polygon's edges. Shape (1, 1), m.
@@ -253,8 +251,7 @@ def _corners(shape: CollisionShape) -> Array:
         if shape.kind == "capsule":
             corners = ends + radius * down
         else:
-            lowest = np.arctan2(down[1], down[0])  # a vertex at the rim's lowest point
-            angles = lowest + FULL_TURN * np.arange(RIM) / RIM
+            angles = np.arctan2(down[1], down[0]) + FULL_TURN * np.arange(RIM) / RIM  # a vertex at the lowest point
             rim = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
             # the lowest part of the rim, to a slope of a thousandth: a wheel stands on its lowest line alone
             rim = rim[rim @ down >= (rim @ down).max() - 1e-3 * radius]

@@ -95,11 +95,9 @@ def quintic(start: End, end: End) -> Array:
     value = end_value - start_value - start_rate - start_second / 2
     rate = end_rate - start_rate - start_second
     bend = end_second - start_second
-    third, fourth, fifth = (
-        10 * value - 4 * rate + bend / 2,
-        -15 * value + 7 * rate - bend,
-        6 * value - 3 * rate + bend / 2,
-    )
+    third = 10 * value - 4 * rate + bend / 2
+    fourth = -15 * value + 7 * rate - bend
+    fifth = 6 * value - 3 * rate + bend / 2
     return np.stack([start_value, start_rate, start_second / 2, third, fourth, fifth], axis=-2)
 
 
@@ -189,8 +187,7 @@ def _shape_table() -> tuple[Array, Array]:
     nearly[-1] = (angles[-1] + angles[-2]) / 2  # on a straight line every factor is best: take the limit
     after[-1] = [-np.cos(nearly[-1]), np.sin(nearly[-1]), 0.0]
     ends = -before, before, zero, after, after, zero
-    shapes = best_shape(ends, np.ones(SEARCH.table_angles), SEARCH.table_samples)
-    return angles, shapes / (2 * np.sin(nearly / 2))
+    return angles, best_shape(ends, np.ones(SEARCH.table_angles), SEARCH.table_samples) / (2 * np.sin(nearly / 2))
 
 
 def best_shape(ends: Ends, remaining: Array, samples: int = SEARCH.samples) -> Array:
@@ -429,9 +426,8 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
     `predictor_corrector`; `nodes` is the number of quadrature nodes for each Newton step, the last of which determines
     the drift.
     """
-    numbers = tuple(
-        require.count("mapping: nodes", n, 1, MAX_TERMS) for n in require.each("mapping: nodes", nodes, int)
-    )
+    nodes = require.each("mapping: nodes", nodes, int)
+    numbers = [require.count("mapping: nodes", n, 1, MAX_TERMS) for n in nodes]
     if not numbers:
         raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
     state, coefficients, steps, rate = _symbols(degree)

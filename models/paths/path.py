@@ -84,8 +84,7 @@ class Path:
     def __post_init__(self) -> None:
         segments = checked_segments(self.segments)
         set_fields(self, segments=segments, lengths=np.array([segment.length for segment in segments]))
-        for name in FRAME:
-            set_fields(self, **{name: np.array([getattr(segment, name) for segment in segments])})
+        set_fields(self, **{name: np.array([getattr(each, name) for each in segments]) for name in FRAME})
         self._check_gaps()
         self._set_orientations()
         self._check_corners()
@@ -172,8 +171,7 @@ class Path:
 
     def corner_angles(self) -> Array:
         """Return the path's interior angle at each vertex, pi if the tangent is continuous. Shape (n - 1,), rad."""
-        index = np.arange(len(self.segments) - 1)
-        return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
+        return _angles(self.at(np.arange(len(self.segments) - 1), self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
         """Return the path moved to a given pose in the world; tool orientations rotate with the path.
@@ -274,9 +272,8 @@ def checked_segments(segments: Any) -> tuple[Segment, ...]:
 
 def interior_angles(segments: Sequence[Segment]) -> Array:
     """Return the interior angle between each segment and the next, pi if they join smoothly. Shape (n - 1,), rad."""
-    start, tangent, normal, k, w, length = (
-        np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
-    )
+    columns = (np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length"))
+    start, tangent, normal, k, w, length = columns
     ends = screw(start, tangent, normal, curvature=k, torsion=w, distance=length)[1]
     for i, each in enumerate(segments):
         if isinstance(each, Spline):
@@ -324,7 +321,6 @@ def fit_splines(
     collinear lines become one. `smooth` rounds the remaining corners.
 
     Args:
-        path: The path.
         deviation: Largest distance (m) between the given path and the smooth one, as for `smooth`.
         angle: Largest angle (rad) between the tool orientations of a spline and of the path at equal parameters,
             checked at the ends and in the middle of each segment.
@@ -371,8 +367,7 @@ def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
     last = len(counts) - 1
     index, distance = np.append(index, last), np.append(share * path.lengths[index], path.lengths[last])
     points = path.at(index, distance)[0]
-    turned = path.turns or path.oriented
-    return Polyline(points, path.turn_at(index, distance)[0] if turned else None), number
+    return Polyline(points, path.turn_at(index, distance)[0] if path.turns or path.oriented else None), number
 
 
 def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: float) -> NDArray[np.bool_]:
@@ -391,8 +386,7 @@ def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: fl
     before = np.append(np.inf, np.where(sharp, np.inf, lengths[1:] ** 2 * bends / lengths[:-1] / 8))
     is_long = np.minimum(before, after) > RUNS.long * tolerance
     for k in np.flatnonzero(is_long):
-        off_chord = distances_from_chord(points[corners[k] : corners[k + 1] + 1]).max()
-        is_long[k] = off_chord <= RUNS.straight * tolerance
+        is_long[k] = distances_from_chord(points[corners[k] : corners[k + 1] + 1]).max() <= RUNS.straight * tolerance
     at_ends = np.zeros(len(points), dtype=bool)
     at_ends[corners[1:-1][sharp]] = True
     at_ends[corners[:-1][is_long]] = at_ends[corners[1:][is_long]] = True

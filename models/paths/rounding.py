@@ -87,8 +87,7 @@ class _Corners(NamedTuple):
     def with_best_shape(self, remaining: Array) -> _Corners:
         """Return the corners with the shape factors that give each quintic blend the least peak curvature."""
         shape, curved = corner_shape(self.path.corner_angles()[self.vertices]), self.curved
-        subset = self.subset(curved)
-        shape[curved] = best_shape(subset.ends(remaining[curved]), remaining[curved])
+        shape[curved] = best_shape(self.subset(curved).ends(remaining[curved]), remaining[curved])
         return self._replace(shape=shape)
 
 
@@ -128,10 +127,8 @@ def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> 
     aim = tolerance * (1 - SETTINGS.reserve)
     for _ in range(SETTINGS.iterations):
         subset = corners.subset(curved)
-        over = (
-            np.maximum(_task_to_blend(subset, distances[curved]), _deviations(subset, distances[curved])[1])
-            / tolerance[curved]
-        )
+        sizes = distances[curved]
+        over = np.maximum(_task_to_blend(subset, sizes), _deviations(subset, sizes)[1]) / tolerance[curved]
         curved, over = curved[over > 1], over[over > 1]
         if not curved.size:
             break
@@ -179,15 +176,13 @@ def _initial_distances(corners: _Corners, tolerance: Array, longest: Array) -> A
     # between two lines the deviation is proportional to the remaining distance, so one trial suffices
     lines = np.setdiff1d(np.arange(len(longest)), arcs, assume_unique=True)
     if lines.size:
-        subset = corners.subset(lines)
-        corner, legs = _deviations(subset, longest[lines])
+        corner, legs = _deviations(corners.subset(lines), longest[lines])
         largest = np.maximum(corner, legs * (1 + SETTINGS.reserve))
         with np.errstate(divide="ignore"):
             distances[lines] = longest[lines] * np.minimum(1.0, tolerance[lines] / largest)
     if arcs.size:
-        distances[arcs] = _solve_distances(
-            corners.subset(arcs), tolerance[arcs] * (1 - SETTINGS.reserve), longest[arcs]
-        )
+        aim = tolerance[arcs] * (1 - SETTINGS.reserve)
+        distances[arcs] = _solve_distances(corners.subset(arcs), aim, longest[arcs])
     return distances
 
 
@@ -268,10 +263,9 @@ def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
 
 def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
     """Return distances of points (V, S, 3) of V blends from the closer of the two path parts that a blend replaces."""
-    return np.minimum(
-        _distance_to_segment(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
-        _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining),
-    )
+    lengths = path.lengths[vertices]
+    before = _distance_to_segment(path, vertices, points, lengths - remaining, lengths)
+    return np.minimum(before, _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining))
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
@@ -308,8 +302,7 @@ def _distance_to_curve(path: Path, index: NDArray[np.intp], points: Array, first
         return np.concatenate([_distance_to_curve(path, index[p], points[p], first[p], last[p]) for p in parts])
 
     def at(s: Array) -> list[Array]:
-        values = path.at(np.repeat(index, s.shape[1]), s.ravel())
-        return [value.reshape(*s.shape, 3) for value in values]
+        return [value.reshape(*s.shape, 3) for value in path.at(np.repeat(index, s.shape[1]), s.ravel())]
 
     rate = np.where(path.is_spline, 0.0, np.hypot(path.curvature, path.torsion))  # at its end a spline is nearly a line
     turns = float((rate[index] * (last - first)).max()) / FULL_TURN
@@ -388,18 +381,9 @@ def smooth(
     curve_cells = cells(coefficients)
     lengths = rests[segment]
     lengths[is_curve] = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(curves))
+    bounds = np.concatenate([[0.0], np.cumsum(lengths)])
     smoothed = SmoothPath(
-        path,
-        kind,
-        distances,
-        corners.shape,
-        coefficients,
-        np.concatenate([[0.0], np.cumsum(lengths)]),
-        segment,
-        blend,
-        curve,
-        splines,
-        curve_cells,
+        path, kind, distances, corners.shape, coefficients, bounds, segment, blend, curve, splines, curve_cells
     )
     if path.turns:
         _check_turns(smoothed)

@@ -279,8 +279,7 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the axial and tangential parts of a helix's tangent, the vector towards its axis, (..., 3) each, and its
-    rotation rate, rad/m.
+    """Return axial and tangential part of a helix's tangent, vector to the axis, (..., 3) each, and turn rate, rad/m.
 
     Arguments as for `screw`.
     """

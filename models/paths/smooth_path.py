@@ -215,10 +215,8 @@ class SmoothPath:
         counts = np.concatenate([np.full(len(on_segment), per_segment), np.full(len(self.cells.length), per_cell)])
         order = np.argsort(starts, kind="stable")
         starts, lengths, counts = starts[order], lengths[order], counts[order]
-        first = np.cumsum(counts) - counts
-        step = np.arange(counts.sum()) - np.repeat(first, counts)
-        inside = np.repeat(starts, counts) + np.repeat(lengths / counts, counts) * step
-        return np.append(inside, self.length)
+        step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return np.append(np.repeat(starts, counts) + np.repeat(lengths / counts, counts) * step, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
         """Return the speed, (P,), on every segment and blend, given the speeds on the segments.
@@ -286,8 +284,7 @@ class SmoothPath:
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
         """Return points of segments, and their derivatives, at distances from the end of the preceding blend."""
-        start_offset = np.concatenate([[0.0], self.remaining])[segment]
-        return self.path.at(segment, start_offset + distance)
+        return self.path.at(segment, np.concatenate([[0.0], self.remaining])[segment] + distance)
 
     def _end_curvatures(self, u: float) -> Array:
         """Return the curvature vector of each segment and blend at its own start (u = 0) or end (u = 1)."""
@@ -416,11 +413,10 @@ def _cell_function() -> Any:
     x = distance / length
     slope0, slope1 = length / (width * speed0), length / (width * speed1)
     guess: Any = first_u + width * x * (slope0 + x * (3 - 2 * slope0 - slope1 + x * (slope0 + slope1 - 2)))
+    rule = list(zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True))
     for _ in range(3):  # the interpolation is already close
         step = guess - first_u
-        mean = sum(
-            float(w) * rate_of(row, first_u + float(n) * step) for n, w in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
-        )
+        mean = sum(float(w) * rate_of(row, first_u + float(n) * step) for n, w in rule)
         guess = guess - (step * mean - distance) / rate_of(row, guess)
     rate_u = ca.dot(first, second) / rate
     rate_uu = (ca.dot(second, second) + ca.dot(first, third) - rate_u**2) / rate

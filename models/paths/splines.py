@@ -245,8 +245,7 @@ def fit_spline(line: Polyline, deviation: float, angle: float, max_pieces: int) 
         worst = np.maximum.reduceat(share, np.searchsorted(x, knots[:-1]))
         if worst.max() <= 1:
             return spline, float(bounds.max())
-        split = worst > 1
-        knots = np.sort(np.append(knots, (knots[:-1] + knots[1:])[split] / 2))
+        knots = np.sort(np.append(knots, (knots[:-1] + knots[1:])[worst > 1] / 2))
     return None
 
 

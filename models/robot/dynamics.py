@@ -86,7 +86,6 @@ def inverse_dynamics(
     A joint also drives the joints that mimic it: its entry is its own torque plus multiplier times each of theirs.
 
     Args:
-        wrenches: External wrenches.
         gravity: In world axes. Shape (3,), m/s^2.
         base_motion: Twist of the base, (angular velocity, velocity of the origin of the root link's frame), and its
             time derivative, world axes. Shape (6, 1) each; at rest if None.
@@ -252,9 +251,8 @@ def _motions_in_links(
         for vector, name in ((base_twist, "base_twist"), (base_acceleration, "base_acceleration"))
     )
     # angular velocity, angular acceleration, acceleration of the origin less gravity
-    omega, alpha, acceleration = (
-        ca.mtimes(ground.rotation.T, part) for part in (twist[0:3], twist_rate[0:3], twist_rate[3:6] - g)
-    )
+    parts = twist[0:3], twist_rate[0:3], twist_rate[3:6] - g
+    omega, alpha, acceleration = (ca.mtimes(ground.rotation.T, part) for part in parts)
     origin = {robot.root: (omega, alpha, acceleration)}
     fields = {robot.root: (acceleration, _field(omega, alpha))}
     for joint in robot.joints:
@@ -313,14 +311,12 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Return the matrix, (6, dof), that maps joint rates to (angular about the world's origin, linear) momentum."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    moments = subtree_moments(robot, frames)
-    return ca.densify(joint_momenta(robot, axes, moments))
+    return ca.densify(joint_momenta(robot, axes, subtree_moments(robot, frames)))
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
     """Return the spatial inertia of the robot with locked joints about the world's origin. World axes, shape (6, 6)."""
-    frames = link_frames(robot, q, world_from_base)
-    return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
+    return ca.densify(subtree_moments(robot, link_frames(robot, q, world_from_base))[robot.root].spatial_inertia())
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
@@ -375,9 +371,8 @@ def momentum_rate(
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
-    return _about_point(
-        about, base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base)
-    )
+    rate = base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base)
+    return _about_point(about, rate)
 
 
 def _about_point(point: Expression, wrench: Expression) -> Expression:

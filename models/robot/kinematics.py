@@ -151,7 +151,6 @@ def frame_jacobian(
     Columns of joints that do not carry the link are zero.
 
     Args:
-        link: Name of the link.
         point: In the link's frame. Shape (3,), m.
     """
     frames, axes = frames_and_axes(robot, q, world_from_base)
@@ -234,8 +233,7 @@ def frames_and_axes(
                 turn = _ParallelRotation(frame.rotation, joint.axis, positions[joint.name])
             axis = ca.mtimes(turn.before, constant(joint.axis))
             axes[joint.name] = (axis, cross(frame.position, axis))
-            turned = ca.mtimes(turn.before, rotation(constant(joint.axis), turn.angle))
-            frame = Frame(turned, frame.position)
+            frame = Frame(ca.mtimes(turn.before, rotation(constant(joint.axis), turn.angle)), frame.position)
         frames[joint.child] = frame
         if turn is not None:
             turns[joint.child] = turn

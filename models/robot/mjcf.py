@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -262,8 +262,7 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
 
 
 def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any, str]]:
-    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return spheres and mesh
-    names.
+    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return them and mesh names.
 
     The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh "".
     """
@@ -277,9 +276,7 @@ def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any
     return replaced
 
 
-def _body_shapes(
-    model: Any, meshes: Mapping[int, Any], reduced: _ReducedFile, omitted: list[str]
-) -> list[dict[str, Any]]:
+def _body_shapes(model: Any, meshes: dict[int, Any], reduced: _ReducedFile, omitted: list[str]) -> list[dict[str, Any]]:
     """Return each body's shapes as arguments of `Link`, from results of `_compile`; add skipped shapes to `omitted`."""
     shapes: list[dict[str, Any]] = [{"collisions": (), "visuals": ()} for _ in range(model.nbody)]
     for k in range(model.ngeom):

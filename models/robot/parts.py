@@ -160,8 +160,7 @@ class Mimic:
     def __post_init__(self) -> None:
         owner = f"mimic of joint {require.name('mimic: joint', self.joint)!r}"
         for argument in ("multiplier", "offset"):
-            number = require.number(f"{owner}: {argument}", getattr(self, argument))
-            set_fields(self, **{argument: number})
+            set_fields(self, **{argument: require.number(f"{owner}: {argument}", getattr(self, argument))})
 
 
 @dataclass(frozen=True, eq=False)

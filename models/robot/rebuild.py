@@ -37,9 +37,8 @@ def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
     """Return the robot with its tip at another frame, which is fixed in a given link."""
-    return replace(
-        robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_or_identity(rotation)
-    )
+    turn = _or_identity(rotation)
+    return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=turn)
 
 
 def with_load(

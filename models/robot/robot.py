@@ -421,8 +421,7 @@ def planar_chain(
     masses = require.array(f"{owner}: masses", masses, (count,))
     moments = require.array(f"{owner}: inertias", masses * lengths**2 / 12 if inertias is None else inertias, (count,))
     mount = require.array(f"{owner}: mount", mount, (2,))
-    root = Link("base") if base is None else require.instance(f"{owner}: base", base, Link)
-    links, joints = [root], []
+    links, joints = [Link("base") if base is None else require.instance(f"{owner}: base", base, Link)], []
     for i in range(count):
         # Only the moment about z affects a planar machine; the others are those of a lamina.
         inertia = np.diag([moments[i] / 2, moments[i] / 2, moments[i]])

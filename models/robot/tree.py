@@ -138,9 +138,7 @@ LIMITS = ("lower", "upper", "velocity", "effort")
 
 
 class JointCoupling(NamedTuple):
-    """Coupling of a joint to the joint vector: position = multiplier times the entry `column` of the vector, plus
-    offset.
-    """
+    """Coupling of a joint to the joint vector: position = multiplier times its entry `column`, plus offset."""
 
     column: int
     multiplier: float
@@ -259,8 +257,6 @@ def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]
 
 
 X, Y, Z = np.eye(3)
-
-
 Parts: TypeAlias = tuple[tuple[Link, ...], tuple[Joint, ...]]
 """Links and joints of a robot."""
 

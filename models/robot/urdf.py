@@ -199,22 +199,19 @@ def parse_file(source: Source, kind: str, unbound: list[str] | None = None) -> t
         ModelError: The source is unreadable or malformed.
     """
     text, lines_before = "", 0
-    data: str | bytes = b""
     if isinstance(source, str):
-        data = text = source.lstrip(BLANK)
+        text = source.lstrip(BLANK)
         lines_before = source[: len(source) - len(text)].count("\n")
-    try:
-        if isinstance(source, str) and not text:
+        if not text:
             message = f"source: an empty text cannot be read as {kind}; give the XML or the path of a file"
             raise ModelError(message, name="source", value=source)
-        if text.startswith("<"):
-            origin = "the given text"
-        else:
-            if not isinstance(source, str | os.PathLike):
-                message = f"a {kind} source is a text or a path, not {type(source).__name__}"
-                raise ModelError(message, name="source", value=source)
-            origin = f"file {os.fspath(source)!r}"
-            data = read_regular(source, INPUT_LIMITS.description_bytes)
+    elif not isinstance(source, os.PathLike):
+        message = f"a {kind} source is a text or a path, not {type(source).__name__}"
+        raise ModelError(message, name="source", value=source)
+    is_text = text.startswith("<")
+    origin = "the given text" if is_text else f"file {os.fspath(source)!r}"
+    try:
+        data: str | bytes = text if is_text else read_regular(source, INPUT_LIMITS.description_bytes)
         return parse_xml(data, unbound), origin
     except ElementTree.ParseError as error:
         line, column = error.position
@@ -224,17 +221,13 @@ def parse_file(source: Source, kind: str, unbound: list[str] | None = None) -> t
     except OSError as error:
         message = f"{origin} cannot be read: {error.strerror or error}; a {kind} text begins with '<'"
         raise ModelError(message, name=origin, value=source) from error
-    except ModelError:
-        raise
     except (ValueError, LookupError) as error:
         raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
 
 
 def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: list[str]) -> tuple[Link, ...]:
     links, reasons = [], []
-    colors = {
-        element.get("name"): color for element in tree.findall("material") if (color := _color(element)) is not None
-    }
+    colors = {each.get("name"): color for each in tree.findall("material") if (color := _color(each)) is not None}
     for arguments in (_link_arguments(element, folder, colors, omitted) for element in tree.findall("link")):
         try:
             links.append(Link(**arguments))
@@ -243,12 +236,8 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: l
             reasons.append(str(error))
         links.append(Link(**arguments, any_inertia=True))  # raises for any error but the inertia
     if reasons and rule == "warn":
-        warn(
-            f"inertias that no body can have are taken as given: {'; '.join(reasons)}. Correct the file, or silence "
-            "this warning: from_urdf(..., inertia='as_given')",
-            ModelWarning,
-            4,
-        )
+        words = f"inertias that no body can have are taken as given: {'; '.join(reasons)}. Correct the file, or "
+        warn(f"{words}silence this warning: from_urdf(..., inertia='as_given')", ModelWarning, 4)
     if not links:
         raise ModelError(f"the robot {tree.get('name') or ''!r} has no <link>", name="link", value=0, limit=1)
     return tuple(links)
@@ -293,12 +282,7 @@ def _color(material: ElementTree.Element) -> Array | None:
 
 
 def _shape(
-    element: ElementTree.Element,
-    owner: str,
-    folder: str,
-    shape_type: type[_Shape],
-    omitted: list[str],
-    **arguments: Any,
+    element: ElementTree.Element, owner: str, folder: str, shape_type: type[_Shape], omitted: list[str], **options: Any
 ) -> list[_Shape]:
     """Return a list with the shape of a <collision> or <visual> element; it is empty if the shape has no volume."""
     shapes: list[Any] = list(child_of(element, "geometry", owner))
@@ -316,7 +300,7 @@ def _shape(
     empty = not size.all() and np.isfinite(size).all() and (kind == "mesh" or size.min() >= 0)
     checked_size = np.where(size == 0, 1.0, size) if empty else size  # so that all else is checked
     try:
-        result = shape_type(kind, checked_size, file, *origin_of(element, owner), folder if file else "", **arguments)
+        result = shape_type(kind, checked_size, file, *origin_of(element, owner), folder if file else "", **options)
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
     if empty:

@@ -71,8 +71,7 @@ class Body:
 
     def __post_init__(self) -> None:
         owner = f"body of link {require.name('body: link', self.link)!r}"
-        reach = checked_shape(f"{owner}: shape", self.shape).reach(np.zeros(3))
-        if not np.isfinite(reach):
+        if not np.isfinite(checked_shape(f"{owner}: shape", self.shape).reach(np.zeros(3))):
             message = f"{owner}: shape {self.shape!r} is unbounded; give a bounded one"
             raise ModelError(message, name="shape", value=self.shape)
         set_fields(self, overhang=require.nonnegative(f"{owner}: overhang", self.overhang, unit="m"))
@@ -157,8 +156,7 @@ def _primitive_body(link: Link, shape: CollisionShape) -> Body:
 
 
 def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
-    """Return volume (m^3), size (radius, length without caps, m) and protrusion (m) of the smallest capsule around a
-    cylinder.
+    """Return volume (m^3), size (radius, length without caps, m) and protrusion (m) of a cylinder's smallest capsule.
 
     With the capsule radius R, the rims of the cylinder of radius r lie on the caps, which begin sqrt(R^2 - r^2) before
     the cylinder's ends.
@@ -191,9 +189,8 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
     except ModelError as error:
         message = f"link {link.name!r}: {error}"
         raise ModelError(message, name=error.name, value=error.value, limit=error.limit) from error
-    return [
-        Body(link.name, each.shape.placed(shape.rotation, shape.translation), each.overhang, mesh) for each in covers
-    ]
+    pose = shape.rotation, shape.translation
+    return [Body(link.name, each.shape.placed(*pose), each.overhang, mesh) for each in covers]
 
 
 class JointStep(NamedTuple):
@@ -303,7 +300,6 @@ def lever_arms(
             reach = float(np.linalg.norm(offset)) + reach
         if step.joint.kind == "prismatic":
             column, ratio, zero = robot.couplings[step.joint.name]
-            ends = ratio * np.array([low[column], high[column]]) + zero
-            reach += float(np.abs(ends).max())
+            reach += float(np.abs(ratio * np.array([low[column], high[column]]) + zero).max())
     step, down = chain[0]
     return levers[::-1], reach + (float(np.linalg.norm(step.translation)) if down else 0.0)

@@ -169,10 +169,8 @@ def distance_to_box(
         return largest_of(distances, rounding, stop_gradient) + _negative_part(gap, rounding)
     squares = [_segment_box_square(middle, axes[0], box.half, rounding**2, stop_gradient)] if not boxes else []
     if isinstance(core, BoxCore):
-        squares = [
-            *_edge_squares(middle, axes, halves, box.half, stop_gradient),
-            *_corner_squares(box, core, stop_gradient),
-        ]
+        squares = _edge_squares(middle, axes, halves, box.half, stop_gradient)
+        squares += _corner_squares(box, core, stop_gradient)
     square = reduce(ca.fmin, squares)
     # for overlapping cores rounding errors leave a small square with large slopes: set it to zero
     square = square if smooth else square * (gap > 0)

@@ -131,8 +131,7 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
     """Return the distances by which points lie outside a capsule or box, zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
-    own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
-    return np.asarray(own.max(axis=1))
+    return np.asarray((np.abs((points - shape.position) @ shape.rotation) - shape.size / 2).max(axis=1))
 
 
 def _fit_capsule(points: Array) -> Capsule:
@@ -184,10 +183,8 @@ def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, flo
     rows = np.arange(len(bases))
     for k in range(24):  # shrinking steps towards the farthest point: smallest circle (Badoiu & Clarkson 2003)
         farthest = rows, ((x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2).argmax(axis=1)
-        centre_x, centre_y = (
-            centre_x + (x[farthest] - centre_x) / (k + 4),
-            centre_y + (y[farthest] - centre_y) / (k + 4),
-        )
+        centre_x = centre_x + (x[farthest] - centre_x) / (k + 4)
+        centre_y = centre_y + (y[farthest] - centre_y) / (k + 4)
     distances = (x - centre_x[:, None]) ** 2 + (y - centre_y[:, None]) ** 2
     radius = np.sqrt(distances.max(axis=1)) * np.array(SETTINGS.radii)[:, None]
     caps = np.sqrt(np.maximum(radius[:, :, None] ** 2 - distances, 0))
@@ -287,8 +284,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
     low, high = [triangles[count == 3]], [triangles[count == 0]]
     for lone, one_side, other_side in ((below, low, high), (~below, high, low)):
         rows = np.flatnonzero(lone.sum(axis=1) == 1)
-        first = lone[rows].argmax(axis=1)
-        order = (first[:, None] + np.arange(3)) % 3
+        order = (lone[rows].argmax(axis=1)[:, None] + np.arange(3)) % 3
         corners = triangles[rows[:, None], order]
         height = heights[rows[:, None], order]
         a, b, c = (corners[:, k] for k in range(3))
@@ -399,8 +395,7 @@ def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
 
 def _to_json(each: Cover) -> dict[str, Any]:
     names = ("radius", "start", "end") if isinstance(each.shape, Capsule) else ("size", "position", "rotation")
-    entries = {name: np.asarray(getattr(each.shape, name)).tolist() for name in names}
-    return entries | {"overhang": each.overhang}
+    return {name: np.asarray(getattr(each.shape, name)).tolist() for name in names} | {"overhang": each.overhang}
 
 
 def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:

@@ -137,9 +137,8 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
         return ca.vertcat(place + ca.mtimes(turn, ca.DM(shape.point)), ca.mtimes(turn, ca.DM(shape.normal)))
     assert isinstance(shape, Box)
     half = require.array("distance: size", shape.size, (3,), unit="m") / 2
-    return ca.vertcat(
-        place + ca.mtimes(turn, ca.DM(shape.position)), ca.vec(ca.mtimes(turn, ca.DM(shape.rotation))), half
-    )
+    axes = ca.vec(ca.mtimes(turn, ca.DM(shape.rotation)))
+    return ca.vertcat(place + ca.mtimes(turn, ca.DM(shape.position)), axes, half)
 
 
 def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0) -> Any:
@@ -342,9 +341,8 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
         if isinstance(core, HullCore):
             heights = [dot(shares, _scalars(vertex)) for vertex in core.hull.vertices]
             smooth = rounding > 0 and len(heights) > 1
-            return middle + (
-                soft_minimum(heights, rounding / log(len(heights))) if smooth else reduce(ca.fmin, heights)
-            )
+            least = soft_minimum(heights, rounding / log(len(heights))) if smooth else reduce(ca.fmin, heights)
+            return middle + least
         reaches = [h * share for h, share in zip(core.half, shares, strict=True)]
     slack = rounding / len(reaches) if reaches else 0.0
     return middle - sum(smooth_abs(reach, slack) for reach in reaches)
@@ -360,8 +358,7 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
         return []
     local = _in_frame(second, first.centre, first.axes)
     directions = np.vstack([first.hull.normals, _edge_directions(first.hull)])
-    offsets = (directions @ first.hull.vertices.T).max(axis=1)
-    pairs = zip(directions, offsets, strict=True)
+    pairs = zip(directions, (directions @ first.hull.vertices.T).max(axis=1), strict=True)
     return [_least_height(local, _scalars(along), (0.0, 0.0, 0.0), rounding) - float(offset) for along, offset in pairs]
 
 

@@ -108,8 +108,7 @@ def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
     first = np.unique(same, return_index=True)[1]
-    order = np.argsort(np.argsort(first))
-    return np.sort(first), order[same]
+    return np.sort(first), np.argsort(np.argsort(first))[same]
 
 
 def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -130,9 +129,8 @@ def is_box(points: np.ndarray) -> bool:
     corners = points[0] + np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) @ edges
     size = float(squares.max())
     right = np.abs(squares - np.diag(squares.diagonal())).max() <= GAP_TOLERANCE * size
-    return bool(
-        right and (squares.diagonal() > 0).all() and np.abs(corners - points).max() <= GAP_TOLERANCE * size**0.5
-    )
+    fits = np.abs(corners - points).max() <= GAP_TOLERANCE * size**0.5
+    return bool(right and (squares.diagonal() > 0).all() and fits)
 
 
 def nearest_directions(
@@ -160,8 +158,7 @@ def nearest_directions(
     else:
         on_first, on_second, difference = _between_hulls(first, second)
     length = np.linalg.norm(difference, axis=1)
-    size = np.abs(first).max(initial=0.0) + np.abs(second).max(initial=0.0)
-    separated = length > GAP_TOLERANCE * size
+    separated = length > GAP_TOLERANCE * (np.abs(first).max(initial=0.0) + np.abs(second).max(initial=0.0))
     direction = np.where(separated[:, None], difference / np.where(separated, length, 1.0)[:, None], 0.0)
     if not separated.all():
         direction[~separated] = _least_overlap(first[~separated], second[~separated], boxes)
@@ -187,8 +184,7 @@ def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of a segment (K, 2, 3) and a box (K, 8, 3), and the vectors between these
-    points.
+    """Return the closest points of K pairs of a segment (K, 2, 3) and a box (K, 8, 3), and the vectors between them.
 
     Half the derivative of the squared distance in the position s along the segment is increasing and piecewise linear,
     with kinks where the segment enters or leaves a slab of the box. Its root is interpolated between two kinks.
@@ -231,9 +227,8 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
         support_first = p[rows, (p @ v[:, :, None])[:, :, 0].argmax(axis=1)]
         support_second = q[rows, (q @ v[:, :, None])[:, :, 0].argmin(axis=1)]
         square = (v * v).sum(axis=1)
-        unconverged = (square - (v * (support_second - support_first)).sum(axis=1) > GAP_TOLERANCE * square) & (
-            square > 0
-        )
+        excess = square - (v * (support_second - support_first)).sum(axis=1)
+        unconverged = (excess > GAP_TOLERANCE * square) & (square > 0)
         if not unconverged.all():
             active, a, b, v, square = (part[unconverged] for part in (active, a, b, v, square))
             support_first, support_second = support_first[unconverged], support_second[unconverged]
@@ -256,8 +251,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each of K tetrahedra (K, 4, 3), the barycentric weights of the point nearest to the origin, and this
-    point.
+    """Return barycentric weights of the point nearest to the origin in each of K tetrahedra (K, 4, 3), and this point.
 
     The vertices may coincide. Only faces that contain the last vertex are tried.
     """

@@ -139,8 +139,7 @@ def _is_file(path: Path) -> bool:
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Faces]:
     """Return the vertices, (n, 3), m, and the triangles, (m, 3), of a mesh file, read by `read_painted_mesh`."""
-    vertices, faces, _ = read_painted_mesh(path)
-    return vertices, faces
+    return read_painted_mesh(path)[:2]
 
 
 def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
@@ -150,8 +149,6 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
     <up_axis> is ignored, as by RViz, MoveIt and other readers of URDF, for which robots' files are made. Polygons
     become fans of triangles; lines and points are ignored.
 
-    Args:
-        path: Path of the file.
 
     Returns:
         The mesh; all vertices are finite and referenced. STL has no colours. The colours of an OBJ file are those of
@@ -187,9 +184,8 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
 def _read_stl(file: Path, data: bytes) -> Triangles:
     """Read a binary or text STL file, told apart by the size of the file, since both kinds may begin with "solid"."""
-    count = (
-        int.from_bytes(data[STL_HEADER_BYTES - 4 : STL_HEADER_BYTES], "little") if len(data) >= STL_HEADER_BYTES else -1
-    )
+    header = data[:STL_HEADER_BYTES]
+    count = int.from_bytes(header[-4:], "little") if len(header) == STL_HEADER_BYTES else -1
     exact = count >= 0 and len(data) == STL_HEADER_BYTES + STL_RECORD.itemsize * count
     if not exact and data[:512].lstrip()[:5].lower() == b"solid":
         return _read_stl_text(file, data)
@@ -302,9 +298,7 @@ def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
 
 
 def _vertex_index(file: Path, entry: str, count: int, line: int) -> int:
-    """Return the vertex index, from zero, of a face corner "v", "v/vt" or "v/vt/vn"; a negative v counts from the last
-    one.
-    """
+    """Return the vertex index, from zero, of a face corner "v", "v/vt" or "v/vt/vn"; negative v count from the end."""
     try:
         index = int(entry.partition("/")[0])
     except ValueError:
@@ -361,9 +355,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
 
 
 def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
-    """Return a Collada document reduced to elements that pycollada reads correctly, and the document's unit of length,
-    m.
-    """
+    """Return a Collada document reduced to elements that pycollada reads correctly, and its unit of length, m."""
     try:
         document = parse_xml(data)
     except ElementTree.ParseError as error:

@@ -160,11 +160,8 @@ def checked_pairs(
             excluded[links] = reason
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
     excluded = {k: why for k, why in excluded.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
-    pairs = Pairs(tuple(checked), excluded)
-    store_value(
-        key, {"checked": pairs.checked, "excluded": [[*pair, why.value] for pair, why in pairs.excluded.items()]}
-    )
-    return pairs
+    store_value(key, {"checked": checked, "excluded": [[*pair, why.value] for pair, why in excluded.items()]})
+    return Pairs(tuple(checked), excluded)
 
 
 def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Reason], *numbers: Any) -> str:
@@ -262,8 +259,7 @@ class _PairClassifier:
         therefore classified by the convex hulls of meshes.
         """
         pair = self._pair(first.link, first.shape, second.link, second.shape)
-        overhang = first.overhang + second.overhang
-        reason = pair.classify(self.low, self.high, self.configurations, self.margin, overhang)
+        reason = pair.classify(self.low, self.high, self.configurations, self.margin, first.overhang + second.overhang)
         two_joints = len(pair.up) + len(pair.down) == 2
         if not (first.mesh or second.mesh) or not (reason != NEVER if two_joints else reason == COVERED):
             return reason, False
@@ -274,13 +270,10 @@ class _PairClassifier:
             if two_joints:
                 self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
             else:
-                collides = (hulls.bounds(self.configurations)[0] <= 0).all()
-                self._by_hulls[key] = ALWAYS if collides else None
+                self._by_hulls[key] = ALWAYS if (hulls.bounds(self.configurations)[0] <= 0).all() else None
         if (hull_reason := self._by_hulls[key]) is not None:
             return hull_reason, False
-        if reason == COVERED:
-            return None, not two_joints
-        return reason, False
+        return (None, not two_joints) if reason == COVERED else (reason, False)
 
     def _pair(self, first_link: str, first: Shape, second_link: str, second: Shape) -> _BodyPair:
         parts = self.parts
@@ -358,10 +351,8 @@ class _BodyPair:
         """Return lower bounds, m, of the distance at given poses of the second body, exact if the search converges."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
-        first, second = (
-            np.broadcast_to(first, (len(turn), *first.shape)),
-            second @ turn.transpose(0, 2, 1) + shift[:, None],
-        )
+        first = np.broadcast_to(first, (len(turn), *first.shape))
+        second = second @ turn.transpose(0, 2, 1) + shift[:, None]
         direction = nearest_directions(first, second, (isinstance(shapes[0], Box), isinstance(shapes[1], Box)))[0]
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 

@@ -122,8 +122,8 @@ class Capsule(_SweptCore):
 
     def __post_init__(self) -> None:
         set_fields(self, radius=require.nonnegative("capsule: radius", self.radius, unit="m"))
-        for name in ("start", "end"):
-            set_fields(self, **{name: require.array(f"capsule: {name}", getattr(self, name), (3,))})
+        ends = ("start", "end")
+        set_fields(self, **{name: require.array(f"capsule: {name}", getattr(self, name), (3,)) for name in ends})
         if self.radius == 0 and (self.start == self.end).all():
             message = "capsule: radius and length are zero; give a positive radius or two different ends"
             raise ModelError(message, name="radius", value=0.0, limit=0.0)
@@ -159,8 +159,7 @@ class Cylinder(Polytope):
 
     def __post_init__(self) -> None:
         for name in ("radius", "length"):
-            size = require.positive(f"cylinder: {name}", getattr(self, name), unit="m")
-            set_fields(self, **{name: size})
+            set_fields(self, **{name: require.positive(f"cylinder: {name}", getattr(self, name), unit="m")})
         set_fields(self, position=_checked_position(self.position, "cylinder"))
         set_fields(self, rotation=require.rotation("cylinder: rotation", self.rotation))
 
@@ -310,7 +309,6 @@ class Mesh(Polytope):
 
 
 Shape: TypeAlias = Sphere | Capsule | Cylinder | Box | HalfSpace | Mesh
-
 SHAPE_KINDS: tuple[type[Shape], ...] = get_args(Shape)
 
 
@@ -384,10 +382,9 @@ class MovingObstacle:
             except Exception as error:  # also errors inside the function
                 message = f"moving: {name} is no function of a casadi symbol, the time: {error}"
                 raise ModelError(message, name=name, value=function) from error
-            if value.shape != shape or any(not ca.is_equal(symbol, time) for symbol in ca.symvar(value)):
-                message = (
-                    f"moving: {name} gives {value.shape} of {ca.symvar(value)}; {shape} of the time alone expected"
-                )
+            symbols = ca.symvar(value)
+            if value.shape != shape or any(not ca.is_equal(symbol, time) for symbol in symbols):
+                message = f"moving: {name} gives {value.shape} of {symbols}; {shape} of the time alone expected"
                 raise ModelError(message, name=name, value=value.shape, limit=shape)
             parts.append(value)
         set_fields(self, _at=ca.Function("moving", [time], [parts[1], parts[0]]))

@@ -49,9 +49,8 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     limits = replace(limits_by_name(robot, {kind: of for kind, of in by_name.items() if of}), friction=options.friction)
     obstacles = read_obstacles(options.obstacles) if options.obstacles else ()
     ignored, folders = tuple(options.ignore), tuple(options.folder)
-    scene = Scene(
-        obstacles, options.clearance, ignored, options.srdf, folders, "skip" if options.no_meshes else "raise"
-    )
+    missing: Any = "skip" if options.no_meshes else "raise"
+    scene = Scene(obstacles, options.clearance, ignored, options.srdf, folders, missing)
     progress("reading the trajectory")
     names, columns = [joint.name for joint in robot.joints if joint.moves], _names(options.columns)
     raw = read_trajectory(options.trajectory, columns=columns, period=options.period, topic=options.topic, joints=names)

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from models.errors import DetailedError, ModelError
+from models.errors import DetailedError
 from ocp.app.batch.result_store import (
     Payload,
     Result,
@@ -90,7 +90,7 @@ def failure_payload(status: str, error: str, message: str) -> Payload:
 def message_of(error: BaseException) -> str:
     """Return the message of an exception, and the file and line of its origin unless this package raised it."""
     words = str(error).encode("utf-8", "replace").decode()
-    if isinstance(error, DetailedError | ModelError):
+    if isinstance(error, DetailedError):
         return words
     steps = [step for step in traceback.extract_tb(error.__traceback__) if step.filename != __file__]
     location = f" ({os.path.basename(steps[-1].filename)}, line {steps[-1].lineno})" if steps else ""
@@ -127,7 +127,7 @@ def cached(make: Function, *arguments: Any) -> Any:
             try:
                 _CACHE[key] = make(*arguments), inputs
             except Exception as error:
-                if isinstance(error, DetailedError | ModelError) or getattr(error, "errno", None) in DISK_ERRORS:
+                if isinstance(error, DetailedError) or getattr(error, "errno", None) in DISK_ERRORS:
                     raise
                 call = f"{key[0][0]}({', '.join(map(repr, arguments))})"
                 words = f"cached: {call} raised {type(error).__name__}: {message_of(error)}"
@@ -172,9 +172,7 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Outcome of a job: key of the task, data of its result (None if the task must be sent again), and number of
-    workers that ended while they ran the task.
-    """
+    """Outcome of a job: key of its task, result (None: to be sent again), and number of workers that ended with it."""
 
     key: str
     payload: Payload | None
@@ -202,8 +200,7 @@ class Engine:
         try:
             import distributed
         except ImportError as error:
-            words = f"run_batch: Dask is not installed; {INSTALL}"
-            raise ProblemError(words, name="cluster", value=cluster) from error
+            raise ProblemError(f"run_batch: Dask is not installed; {INSTALL}", name="cluster", value=cluster) from error
         self._dask: Any = distributed
         self._function, self._near, self._cluster = function, near, cluster
         self.settings = settings
@@ -223,8 +220,7 @@ class Engine:
             return self
         try:
             address = self._begin() if isinstance(self._cluster, int) else self._cluster
-            patience = self.settings.patience
-            self._client = self._dask.Client(address, timeout=patience, set_as_default=False)
+            self._client = self._dask.Client(address, timeout=self.settings.patience, set_as_default=False)
         except (OSError, ValueError) as error:
             words = f"cluster: no scheduler answers at {self._cluster}: {error}"
             raise ProblemError(words, name="cluster", value=self._cluster) from error
@@ -318,8 +314,7 @@ class Engine:
         """Send a job to a worker."""
         self._count += 1
         number, key = self._count, f"{self._function.__name__}-{job.key}-{self._name}-{self._count}"
-        arguments = self._function, job.task, self._near, job.guess
-        future = self._client.submit(attempt, *arguments, key=key, pure=False)
+        future = self._client.submit(attempt, self._function, job.task, self._near, job.guess, key=key, pure=False)
         self._running[number] = future, job
         future.add_done_callback(lambda _: self._finished.put(number))
 

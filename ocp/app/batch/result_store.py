@@ -99,10 +99,9 @@ def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bo
 
 def canonical_text(value: Any, where: str) -> str:
     """Return the same JSON text for equal data: names are sorted, floats have all digits, and 1 differs from 1.0."""
+    data = as_data(value, where)
     try:
-        return json.dumps(as_data(value, where), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    except ProblemError:
-        raise
+        return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except ValueError as error:  # an integer with more digits than Python writes
         raise ProblemError(f"{where} cannot be written: {error}", name=where) from error
 
@@ -213,27 +212,23 @@ class ResultStore:
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """Return the existing store of results in a folder; raise ProblemError if the folder has no store of this
-        format.
-        """
+        """Return the existing store of results in a folder; raise ProblemError if it has no store of this format."""
         path = checked_folder(folder)
         for link in (path / name for name in sorted(OWN_NAMES) if (path / name).is_symlink()):
             words = f"{link} is a link and may lead out of the folder; link the whole folder instead"
             raise ProblemError(words, name="folder", value=str(link))
         try:
             head = load_json(path / HEAD)
-            store = cls(path, str(head["function"]), str(head["version"]))
-            if head["format"] != FORMAT:
-                words = f"{path} has batch format {head['format']}, not {FORMAT}; use another folder"
-                raise ProblemError(words, name="folder", value=str(path), limit=FORMAT)
+            store, batch_format = cls(path, str(head["function"]), str(head["version"])), head["format"]
         except (FileNotFoundError, NotADirectoryError):
             words = f"{path} is not the folder of a batch: it has no {HEAD}"
             raise ProblemError(words, name="folder", value=str(path)) from None
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            if isinstance(error, ProblemError):
-                raise
             words = f"{path / HEAD} is damaged: {error!r}; use another folder"
             raise ProblemError(words, name="folder", value=str(path)) from error
+        if batch_format != FORMAT:
+            words = f"{path} has batch format {batch_format}, not {FORMAT}; use another folder"
+            raise ProblemError(words, name="folder", value=str(path), limit=FORMAT)
         return store
 
     @classmethod
@@ -281,8 +276,7 @@ class ResultStore:
 
     def _has_result(self) -> bool:
         """Return whether the store has the result of at least one task that succeeded."""
-        records = (self.read(key) for key in self.stored_keys())
-        return any(record and record["status"] == "done" for record in records)
+        return any(record and record["status"] == "done" for record in (self.read(key) for key in self.stored_keys()))
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -310,9 +304,8 @@ class ResultStore:
         try:
             path = self._place(key)
             record: Any = None if path.parent.is_symlink() else load_json(path)
-            is_valid = record.keys() == RECORD_FIELDS.keys() and record["key"] == key == key_of(
-                canonical_text(record["task"], "task")
-            )
+            own_key = key_of(canonical_text(record["task"], "task"))
+            is_valid = record.keys() == RECORD_FIELDS.keys() and record["key"] == key == own_key
             is_valid = is_valid and all(isinstance(record[name], kind) for name, kind in RECORD_FIELDS.items())
             if not is_valid or record["status"] not in STATUSES:
                 return None

@@ -131,10 +131,8 @@ def run_batch(
         except OSError as error:
             if isinstance(error, ConnectionError):
                 raise
-            words = (
-                f"{error.strerror or error}; {len(results)} of {len(texts)} results are stored, run again for the rest"
-            )
-            raise OSError(error.errno, words, str(store.folder)) from error
+            rest = f"{len(results)} of {len(texts)} results are stored, run again for the rest"
+            raise OSError(error.errno, f"{error.strerror or error}; {rest}", str(store.folder)) from error
     batch = Batch(store, tuple(results[key] for key in texts))
     if failures == "raise":
         batch.check()
@@ -248,11 +246,10 @@ def coordinates_of(task: Any, names: Sequence[str]) -> Array:
     for name in names:
         value = task.get(name) if isinstance(task, Mapping) else None
         try:
-            part = floats(value).ravel()
+            parts.append(floats(value).ravel())
         except NOT_NUMBERS as error:
             words = f"near: {name!r} is not a number or list of numbers in the task {task!r}"
             raise ProblemError(words, name=name, value=value) from error
-        parts.append(part)
     return np.concatenate(parts) if parts else np.zeros(0)
 
 

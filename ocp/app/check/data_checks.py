@@ -216,8 +216,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
     """Return the indices of samples in order of time; append faults for decreasing or repeated times to `faults`."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
-    descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
-    for violated, words in descriptions:
+    for violated, words in (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated"):
         if violated.any():
             k = int(np.flatnonzero(violated)[0])
             more = f", and {int(violated.sum()) - 1} times more" if violated.sum() > 1 else ""
@@ -340,8 +339,7 @@ def _check_velocities(samples: _Samples) -> None:
     t, q, v, names, faults = samples.t, samples.q, samples.v, samples.names, samples.faults
     if v is None or len(t) < 10:
         return
-    h = np.diff(t)[:, None]
-    by_positions, stated = np.diff(q, axis=0) / h, (v[1:] + v[:-1]) / 2
+    by_positions, stated = np.diff(q, axis=0) / np.diff(t)[:, None], (v[1:] + v[:-1]) / 2
     peak = np.abs(by_positions).max(axis=0)
     rough = np.median(np.abs(np.diff(by_positions, axis=0)), axis=0)
     ratios: dict[int, float] = {}

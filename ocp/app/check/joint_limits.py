@@ -125,8 +125,7 @@ class PiecewisePolynomial:
     def derivative(self) -> PiecewisePolynomial:
         """Return the time derivative of the piecewise polynomials."""
         degree = self.coefficients.shape[1] - 1
-        width = np.diff(self.t)[:, None, None]
-        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
+        return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / np.diff(self.t)[:, None, None])
 
     def at(self, times: Array) -> Array:
         """Return values (M, n) at times (M,), clipped to the range of `t`; a break belongs to the later interval."""
@@ -136,11 +135,9 @@ class PiecewisePolynomial:
 
     def within(self, interval: Indices, fraction: Array) -> Array:
         """Return values (M, n) of polynomials with given indices (M,) at fractions (M,), 0 to 1, of their intervals."""
-        degree = self.coefficients.shape[1] - 1
-        s = fraction[:, None]
-        terms = (
-            comb(degree, k) * s**k * (1 - s) ** (degree - k) * self.coefficients[interval, k] for k in range(degree + 1)
-        )
+        own, s = self.coefficients[interval], fraction[:, None]
+        degree = own.shape[1] - 1
+        terms = (comb(degree, k) * s**k * (1 - s) ** (degree - k) * own[:, k] for k in range(degree + 1))
         return np.asarray(sum(terms))
 
     @property
@@ -398,8 +395,7 @@ def limit_rows(
         lower, upper = (bounds.lower, bounds.upper) if most is None else (-most, most)
         for column, joint in enumerate(joints):
             name, low, high = robot.joint_names[joint], float(lower[joint]), float(upper[joint])
-            unit = robot.joint(name).unit + per
-            row, fault = _check_limits(quantity, column, order, name, unit, low, high, share)
+            row, fault = _check_limits(quantity, column, order, name, robot.joint(name).unit + per, low, high, share)
             rows.append(row)
             faults += fault
     return rows, faults, unchecked

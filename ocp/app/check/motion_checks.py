@@ -28,7 +28,7 @@ from models import (
 from models.checks import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
-from models.spatial import cross, rotation_from_quaternion
+from models.spatial import cross
 from ocp.app.check.data_checks import CleanedTrajectory
 from ocp.app.check.joint_limits import Fault, Motion, Row, RowVerdict, interpolate
 from ocp.app.files import Waypoints
@@ -106,8 +106,7 @@ def check_efforts(
 ) -> None:
     """Check torques that the file gives at the samples against the torque limits."""
     text = "the file has {value:.5g} {unit} at {time:.6g} s, limit {limit:.5g}"
-    efforts = () if cleaned.efforts is None else cleaned.efforts.T
-    for joint, values in zip(cleaned.joints, efforts, strict=False):
+    for joint, values in zip(cleaned.joints, () if cleaned.efforts is None else cleaned.efforts.T, strict=False):
         name, limit = robot.joint_names[joint], float(bounds.torque[joint])
         t, unit, note = cleaned.motion.t, robot.joint(name).effort_unit, "as given in the file"
         torque = Quantity(f"given torque of {name}", t, values, limit, unit, share=share, note=note)
@@ -115,12 +114,7 @@ def check_efforts(
 
 
 def check_torques(
-    findings: Findings,
-    machine: FixedBase | FreeFloating | Standing,
-    motion: Motion,
-    bounds: JointBounds,
-    *,
-    share: float,
+    findings: Findings, machine: FixedBase | FreeFloating, motion: Motion, bounds: JointBounds, *, share: float
 ) -> None:
     """Check joint torques from inverse dynamics at five times of every interval.
 
@@ -161,14 +155,11 @@ def torque_expression(machine: Machine, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
         frame = machine.world_from_base(())
         return inverse_dynamics(simplify(machine.robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
     base = ca.SX.sym("base", machine.base_size)
-    rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
-    twist = ca.mtimes(rows, machine.base_twist(base, q, v))
-    rate = machine.base_rate(base, q, v)
-    change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
+    twist = ca.mtimes(ca.SX(ca.DM.eye(6)[:, machine.twist_rows]), machine.base_twist(base, q, v))
+    change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(machine.base_rate(base, q, v), v, a))
     frame = machine.world_from_base(base)
-    torque = inverse_dynamics(
-        machine.robot, q, v, a, gravity=(0.0, 0.0, 0.0), world_from_base=frame, base_motion=(twist, change)
-    )
+    zero = (0.0, 0.0, 0.0)
+    torque = inverse_dynamics(machine.robot, q, v, a, gravity=zero, world_from_base=frame, base_motion=(twist, change))
     return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
 
 
@@ -244,8 +235,7 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
     rows = []
     for name, values, unit in (("displacement", distance, "m"), ("rotation", turns, "rad")):
         k, note = int(values.argmax()), "integrated so that momentum is conserved"
-        row = Row(f"{name} of the base", float(values[k]), None, unit, float(motion.t[k]), RowVerdict.INFO, note)
-        rows.append(row)
+        rows.append(Row(f"{name} of the base", float(values[k]), None, unit, float(motion.t[k]), RowVerdict.INFO, note))
     return bases, rows
 
 
@@ -257,13 +247,8 @@ def check_momentum(findings: Findings, machine: FreeFloating, motion: Motion, ba
     q, v = ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
     base, rate = ca.SX.sym("base", size), ca.SX.sym("rate", size)
     frame = machine.world_from_base(base)
-    if size == 3:
-        spin, speed = ca.vertcat(0, 0, rate[2]), ca.vertcat(rate[0], rate[1], 0)
-    else:
-        turn = rotation_from_quaternion(base[3:7])
-        by_rate = ca.reshape(ca.jtimes(ca.vec(turn), base, ca.vertcat(ca.SX(3, 1), rate[3:7])), 3, 3)
-        skew = ca.mtimes(by_rate, turn.T)
-        spin, speed = ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]), rate[:3]
+    plane = ca.DM.eye(6)[:, machine.twist_rows]
+    spin, speed = ca.vertsplit(ca.mtimes(plane, machine.twist_of_rate(base, rate)), 3)
     twist = ca.vertcat(spin, speed - cross(spin, frame.position))
     joints = momentum(robot, q, v, world_from_base=frame)
     total = joints + ca.mtimes(robot_inertia(robot, q, frame), twist)
@@ -277,8 +262,7 @@ def check_momentum(findings: Findings, machine: FreeFloating, motion: Motion, ba
         text = f"{quantity} changes by {{value:.4g}} {unit} at {{time:.6g}} s; that of the joints is {own:.4g}: "
         text += "the given motion of the base is inconsistent"
         limit, name = MOMENTUM_SHARE * own + ROUNDING_SHARE, f"change of {quantity}"
-        each = Quantity(name, times, change, limit, unit, note="base as given")
-        findings.judge(each, ("momentum", robot.root), text)
+        findings.judge(Quantity(name, times, change, limit, unit, note="base as given"), ("momentum", robot.root), text)
 
 
 # ---- clearance ---------------------------------------------------------------------------------------------------
@@ -324,10 +308,8 @@ def _sampled_pairs(scene: CollisionScene, motion: Motion, bases: Array) -> list[
     placements = np.concatenate([bases, (bases[1:] + bases[:-1]) / 2])
     distances = distances_along(scene, placements, motion.position.at(times), times)
     places, unknown = times[distances.argmin(axis=0)] - motion.t[0], np.full((2, 3), np.nan)
-    return [
-        ClosestPair(bodies, distance, distance, time, unknown, scene.clearance)
-        for bodies, distance, time in zip(scene.labels, distances.min(axis=0).tolist(), places.tolist(), strict=True)
-    ]
+    rows = zip(scene.labels, distances.min(axis=0).tolist(), places.tolist(), strict=True)
+    return [ClosestPair(bodies, gap, gap, time, unknown, scene.clearance) for bodies, gap, time in rows]
 
 
 def check_clearance(findings: Findings, scene: CollisionScene, motion: Motion, bases: Array | None) -> None:
@@ -378,8 +360,7 @@ def check_clearance(findings: Findings, scene: CollisionScene, motion: Motion, b
 
 def _verdict(pair: ClosestPair) -> RowVerdict:
     """Return the verdict on the distance between two bodies, which may be below the required one by a tolerance."""
-    failed = pair.distance < pair.required - CLEARANCE_TOLERANCE_M
-    return RowVerdict.of(failed, pair.missed > CLEARANCE_TOLERANCE_M)
+    return RowVerdict.of(pair.distance < pair.required - CLEARANCE_TOLERANCE_M, pair.missed > CLEARANCE_TOLERANCE_M)
 
 
 def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
@@ -394,8 +375,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
     dated_faults = []
     for fault in faults:
         violated = np.flatnonzero(distances[:, columns[fault.name]] < scene.clearance - CLEARANCE_TOLERANCE_M)
-        first = float(times[violated[0]]) if violated.size else fault.time
-        dated_faults.append(replace(fault, first=first))
+        dated_faults.append(replace(fault, first=float(times[violated[0]]) if violated.size else fault.time))
     return dated_faults
 
 

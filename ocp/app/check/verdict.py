@@ -135,11 +135,8 @@ class Check:
         return data
 
 
-FAULT_ORDER = {
-    kind: place
-    for place, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
-}
-"""Ranks of the kinds of faults that are reported first, because they explain other faults."""
+FAULT_ORDER = ("unknown joint", "missing joint", "times", "not a number", "units", "jump")
+"""Kinds of faults that are reported first, in this order, because they explain other faults."""
 
 
 @dataclass(frozen=True)
@@ -206,11 +203,11 @@ class CheckTolerances:
             raise ProblemError(words, name="tip_angle", value=self.tip_angle, limit=0.0)
 
 
-def _checked_machine(machine: Any) -> FixedBase | FreeFloating | Standing:
+def _checked_machine(machine: Any) -> FixedBase | FreeFloating:
     """Return the machine to check; a robot is put on a fixed base, and other types raise ProblemError."""
     if isinstance(machine, Robot):
         return FixedBase(machine)
-    if isinstance(machine, FixedBase | FreeFloating | Standing):
+    if isinstance(machine, FixedBase | FreeFloating):
         return machine
     words = f"machine must be a robot on a fixed, floating or standing base, not {machine!r}"
     raise ProblemError(words, name="machine", value=machine)
@@ -323,7 +320,7 @@ def check_trajectory(
     if not interpretation.names_confirmed:
         is_fixed = complete and not isinstance(machine, FreeFloating)
         suspicions += exchanged_joints(motion, robot, cleaned.joints, is_fixed)
-    findings.faults.sort(key=lambda fault: FAULT_ORDER.get(fault.kind, len(FAULT_ORDER)))
+    findings.faults.sort(key=lambda fault: (*FAULT_ORDER, fault.kind).index(fault.kind))
     return Check(
         trajectory.file,
         robot.name,
@@ -399,9 +396,7 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Audit a plan, check samples of it against the limits of the machine, and evaluate its margin; `settings` are
-    those of the audit.
-    """
+    """Audit a plan, check samples of it against limits, and evaluate its margin; `settings` are those of the audit."""
     verdict = PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
     return replace(verdict, margin=plan.margin().sentence) if verdict.passed else verdict
 
@@ -431,9 +426,7 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check times (M,) and joint positions, rates and accelerations (M, n), the last two possibly None, against a
-    robot's limits.
-    """
+    """Check times (M,), joint positions, and rates and accelerations if not None, (M, n), against a robot's limits."""
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem
         frame = machine.world_from_base(())

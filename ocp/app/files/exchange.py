@@ -63,7 +63,6 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
     nav_msgs/msg/Path with poses at the same times.
 
     Args:
-        plan: The plan.
         file: Name of the log file, which is replaced only when the log is complete.
         period: Sampling period, s.
         frame: Name of the world frame in the messages.
@@ -164,9 +163,7 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of an MCAP log, also those in chunks, in file order; raise ValueError if a record or the log is
-    too large.
-    """
+    """Yield the records of an MCAP log, also those in chunks, in file order; raise ValueError for too large ones."""
     from mcap.exceptions import EndOfFile
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
@@ -217,7 +214,6 @@ def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "pl
     rerun.init("seam", spawn=True); log_rerun(plan, rerun)`.
 
     Args:
-        plan: The plan.
         rerun: The module `rerun`, or an object with its `log`, `send_columns` and archetypes.
         period: Sampling period, s.
         entity: Prefix of the entity paths.
@@ -376,11 +372,9 @@ def write_robot_program(
     language, columns = ROBOT_LANGUAGES[kind], [robot.joint_names.index(name) for name in names]
     linear = [robot.moving_joints[column].kind == "prismatic" for column in columns]
     axes, units = _axes(language, names, linear), ["mm" if each else language.unit for each in linear]
-    values = np.round(trajectory.positions / [PROGRAM_UNITS[unit] for unit in units], language.decimals) + 0.0
-    points = [
-        {axis: f"{value:.{language.decimals}f}" for axis, value in zip(axes, row, strict=True)}
-        for row in values.tolist()
-    ]
+    digits = language.decimals
+    values = np.round(trajectory.positions / [PROGRAM_UNITS[unit] for unit in units], digits) + 0.0
+    points = [{axis: f"{value:.{digits}f}" for axis, value in zip(axes, row, strict=True)} for row in values.tolist()]
     remarks = [f"  {language.comment} {MARK}"] + [
         f"  {language.comment} {axis} = {quote(name, safe='/:')} [{unit}]"
         for axis, name, unit in zip(axes, names, units, strict=True)

@@ -64,7 +64,6 @@ def read_gcode(
     that the arc meets its ends exactly.
 
     Args:
-        file: Name of the file.
         unit: "mm" or "inch", valid until the first G20 or G21. None: mm, with a warning if the file gives no unit
             either.
         feed: Feed, m/s, valid until the first F. None: a move without feed is an error.
@@ -87,17 +86,11 @@ def read_gcode(
     with problem_errors():
         origin = require.array("G-code: start", start, (3,))
         home_position = None if home is None else require.array("G-code: home", home, (3,))
-    reader = _Reader(
-        file,
-        unit,
-        None if feed is None else require.positive("G-code: feed", feed),
-        origin,
-        home_position,
-        checked_reversal("G-code", reversal),
-        None if gap is None else require.positive("G-code: gap", gap),
-        require.flag("G-code: block_delete", block_delete),
-    )
-    return reader.read(read_lines(file))
+    speed = None if feed is None else require.positive("G-code: feed", feed)
+    turn = checked_reversal("G-code", reversal)
+    rounding = None if gap is None else require.positive("G-code: gap", gap)
+    skips = require.flag("G-code: block_delete", block_delete)
+    return _Reader(file, unit, speed, origin, home_position, turn, rounding, skips).read(read_lines(file))
 
 
 class _Reader:
@@ -152,8 +145,7 @@ class _Reader:
                 break
         self._end_path()
         if not self.sections:
-            message = f"{self.file}: no line moves anything; is it G-code?"
-            raise ProblemError(message, name="file", value=str(self.file))
+            raise ProblemError(f"{self.file}: no line moves anything; is it G-code?", name="file", value=str(self.file))
         notes = tuple(Note(text, tuple(numbers)) for text, numbers in self.note_lines.items())
         return Program(tuple(self.sections), self.start, notes)
 
@@ -207,9 +199,8 @@ class _Reader:
             if group is None and code not in IGNORED_CODES and code not in (40, 90, 920, 921, 922, *MACHINE_CODES):
                 self._refuse(f"{code_name(code)} is not known; {REPOST}")
             if group in code_of_group:
-                self._refuse(
-                    f"{code_name(code_of_group[group])} and {code_name(code)} contradict each other; remove one"
-                )
+                pair = f"{code_name(code_of_group[group])} and {code_name(code)}"
+                self._refuse(f"{pair} contradict each other; remove one")
             if group is not None:
                 code_of_group[group] = code
             if code in IGNORED_CODES:
@@ -368,8 +359,7 @@ class _Reader:
         if radius is not None:
             if center_words:
                 self._refuse("the arc has both a radius R and a centre; remove one")
-            ends = start[in_plane], target[in_plane]
-            center = center_from_radius(*ends, radius * unit, clockwise=clockwise, gap=gap)
+            center = center_from_radius(start[in_plane], target[in_plane], radius * unit, clockwise=clockwise, gap=gap)
         else:
             if center_words.pop(plane[2], 0.0) != 0.0:
                 self._refuse(f"{OFFSETS[plane[2]]} is not in the plane of {code_name(self.plane)}; remove it")

@@ -71,10 +71,8 @@ def arcs_about_center(
     difference = abs(radii[0] - radii[1])
     allowed = max(gap, min(RADIUS_SHARE * max(radii), 100 * gap))  # at most two digits fewer than usual
     if difference > allowed:
-        why = (
-            f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre: a difference of {difference:.3g} m"
-        )
-        raise ArcError(why, difference, allowed)
+        why = f"start and end are {radii[0]:.6g} and {radii[1]:.6g} m from the centre: a difference of "
+        raise ArcError(f"{why}{difference:.3g} m", difference, allowed)
     sweep = _sweep(first - center, last - center, clockwise)
     moved = _equidistant_center(center, first, last)
     # displacement of the arc's far side by moving the centre
@@ -126,7 +124,6 @@ def _sweep(first: Array, last: Array, clockwise: bool) -> float:
 
 MOTIONS = (0, 10, 20, 30)
 """Codes of the motions G0, G1, G2 and G3, as ten times their numbers."""
-
 GROUPS: dict[int, str] = {
     **dict.fromkeys((*MOTIONS, 330, 331, 382, 383, 384, 385, 730, 760, *range(810, 900, 10), 50, 51, 52, 53), "motion"),
     **dict.fromkeys(PLANES, "plane"),
@@ -139,7 +136,6 @@ GROUPS: dict[int, str] = {
     **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
 }
 """Modal group of each G code, keyed by ten times its number; a line may have one code of each group."""
-
 REPOST = "post the program without it"
 UNSUPPORTED_CODES: dict[int, str] = {
     **dict.fromkeys((50, 51, 52, 53, 60, 61, 62), f"splines are not supported; {REPOST}, as G1, G2 and G3"),
@@ -177,7 +173,6 @@ M_WORDS = {
 """M words that affect the path, keyed by ten times their numbers; all other M words are ignored."""
 MACHINE_CODES = (280, 281, 300, 301, 530)
 """G codes, as ten times their numbers, that move to, or store, positions that only the machine knows."""
-
 WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
 COMMENT = re.compile(r"\([^()]*\)")
 DELETED = re.compile(r"^/\d*")
@@ -272,8 +267,7 @@ def _reason(line: str) -> str:
         return NOT_RUN
     if any(sign in line for sign in "#[]=<>"):
         return "parameters and expressions are not supported; post the program with plain numbers"
-    rest = WORD.sub("", line)
-    return f"{rest[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
+    return f"{WORD.sub('', line)[:20]!r} is not a G-code word (a letter and a number); correct it or make it a comment"
 
 
 def code_name(tenths: int) -> str:

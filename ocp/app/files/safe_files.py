@@ -137,9 +137,8 @@ def table_numbers(file: FileName, rows: Sequence[TableRow], used: Sequence[bool]
     try:
         return np.array(cells, dtype=float)
     except ValueError as error:
-        row, cell = next(
-            (row, cell) for row, own in zip(rows, cells, strict=True) for cell in own if not is_number(cell)
-        )
+        pairs = ((row, cell) for row, own in zip(rows, cells, strict=True) for cell in own)
+        row, cell = next(pair for pair in pairs if not is_number(pair[1]))
         raise line_error(file, row.number, row.text, f"{cell!r} is not a number; correct it") from error
 
 
@@ -155,9 +154,8 @@ def is_number(cell: str) -> bool:
 NUMBER = re.compile(r"[-+]?(?:\d[\d_]*(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 SCALARS: dict[str, Any] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
-    **{
-        word: value for value, text in ((True, "true"), (False, "false")) for word in (text, text.title(), text.upper())
-    },
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
     **{word: float(word.replace(".", "")) for word in (".inf", "+.inf", "-.inf", ".nan")},
 }
 """Values of plain YAML scalars that are neither numbers nor texts."""
@@ -167,9 +165,7 @@ _NO_KEY = object()
 
 
 def read_tree(file: FileName, kind: str) -> Any:
-    """Return the contents of a JSON file, or of the first document of a YAML file; raise ProblemError if it is invalid
-    or too large.
-    """
+    """Return the contents of a JSON file or of a YAML file's first document; raise ProblemError for invalid ones."""
     text = "\n".join(read_lines(file, longest=None))
     try:
         if kind != "json":
@@ -177,9 +173,8 @@ def read_tree(file: FileName, kind: str) -> Any:
         _check_count(sum(text.count(sign) for sign in ",[{"))
         return checked_depth(json.loads(text))
     except RecursionError as error:
-        raise ProblemError(
-            f"{file} is nested too deeply", name="file", value=str(file), limit=INPUT_LIMITS.nesting
-        ) from error
+        words, limit = f"{file} is nested too deeply", INPUT_LIMITS.nesting
+        raise ProblemError(words, name="file", value=str(file), limit=limit) from error
     except ValueError as error:
         if isinstance(error, ProblemError):
             raise

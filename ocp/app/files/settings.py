@@ -111,11 +111,7 @@ class TomlTable:
         self, name: str, expected: str, default: Any = None, *, least: float = -np.inf, most: float = np.inf
     ) -> Any:
         """Return the entry `name` after checking that it is a number above `least` and at most `most`."""
-
-        def fits(value: Any) -> bool:
-            return bool(np.isfinite(real(value)) and least < real(value) <= most)
-
-        value = self._read(name, default, expected, fits)
+        value = self._read(name, default, expected, lambda value: least < real(value) <= most and real(value) < np.inf)
         return value if value is None or value is default else float(value)
 
     def positive(self, name: str, unit: str, default: Any = None) -> Any:
@@ -181,18 +177,13 @@ class TomlTable:
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
         """Return the entry `name` as a list of texts; empty if it is missing."""
-
-        def fits(value: Any) -> bool:
-            return isinstance(value, list) and all(isinstance(word, str) for word in value)
-
-        return tuple(self._read(name, [], expected, fits))
+        return tuple(self._read(name, [], expected, lambda value: _is_list_of(str, value)))
 
     def pairs(self, name: str, expected: str) -> tuple[tuple[str, str], ...]:
         """Return the entry `name` as a list of pairs of texts; empty if it is missing."""
 
         def fits(value: Any) -> bool:
-            pairs = isinstance(value, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in value)
-            return pairs and all(isinstance(word, str) for pair in value for word in pair)
+            return _is_list_of(list, value) and all(len(pair) == 2 and _is_list_of(str, pair) for pair in value)
 
         return tuple((first, second) for first, second in self._read(name, [], expected, fits))
 
@@ -221,11 +212,7 @@ class TomlTable:
 
     def tables(self, name: str) -> list[TomlTable]:
         """Return all tables of the array of tables [[name]]."""
-
-        def fits(value: Any) -> bool:
-            return isinstance(value, list) and all(isinstance(values, dict) for values in value)
-
-        tables = self._read(name, [], f"tables, each headed [[{name}]]", fits)
+        tables = self._read(name, [], f"tables, each headed [[{name}]]", lambda value: _is_list_of(dict, value))
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
@@ -240,6 +227,11 @@ class TomlTable:
                 similar, known = checks.similar_names(name, self._read_names), dict.fromkeys(self._read_names)
                 hint = f"did you mean {' or '.join(similar)}?" if similar else f"known entries: {', '.join(known)}"
                 raise self.error(name, f"unknown entry {name}; {hint}")
+
+
+def _is_list_of(kind: type, value: Any) -> bool:
+    """Return whether a value is a list with entries of one type only."""
+    return isinstance(value, list) and all(isinstance(each, kind) for each in value)
 
 
 def read_toml(file: FileName) -> TomlTable:
@@ -405,7 +397,6 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
 
     Args:
         file: YAML file with the mapping `joint_limits`, also below `robot_description_planning` or `ros__parameters`.
-        robot: The robot.
         scaling: Whether velocities and accelerations are multiplied by the file's default_velocity_scaling_factor and
             default_acceleration_scaling_factor, as MoveIt does by default.
 

@@ -91,8 +91,7 @@ def _uncertainties(entries: TomlTable, name: str) -> Any:
 
 def _speed(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
     """Read a limit along the path, such as the speed; raise ProblemError if it is not between 1e-6 and 1e6."""
-    words = f"a number above 0, {unit}, of 1e-6 to 1e6"
-    return entries.number(name, words, default, least=0.999e-6, most=1e6)
+    return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
 T = TypeVar("T")
@@ -221,7 +220,6 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     """Read a task file without planning its motion.
 
     Args:
-        file: Name of the file.
         output_folder: Folder to which the names of outputs are relative, and which must contain them; None: the folder
             of the task file.
 

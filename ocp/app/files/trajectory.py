@@ -250,9 +250,8 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
         words = f"{file}: joint_names must be distinct names, not {str(names)[:80]}"
         raise ProblemError(words, name="joint_names", value=names)
     if not isinstance(points, list) or not points or not all(isinstance(point, Mapping) for point in points):
-        raise ProblemError(
-            f"{file}: points must be a list of at least one point", name="points", value=repr(points)[:80]
-        )
+        words = f"{file}: points must be a list of at least one point"
+        raise ProblemError(words, name="points", value=repr(points)[:80])
     t = np.array([_seconds(file, number, point) for number, point in enumerate(points, 1)])
     notes: list[str] = []
     values: dict[str, Any] = dict.fromkeys(KINDS)
@@ -383,11 +382,9 @@ def _read_program(file: FileName, language: RobotLanguage, period: float | None)
     return RawTrajectory(names, t, np.array(rows), None, None, None, np.array(lines), True, notes, str(file))
 
 
-def _name_axis(
-    language: RobotLanguage, joints: dict[str, tuple[str, float]], remark: re.Match[str], late: bool
-) -> None:
+def _name_axis(language: RobotLanguage, joints: dict[str, tuple[str, float]], match: re.Match[str], late: bool) -> None:
     """Store the joint and unit that a program comment assigns to a robot axis; raise ValueError if they are invalid."""
-    axis, column, unit = remark.groups()
+    axis, column, unit = match.groups()
     if axis not in (*language.arm, *language.external):
         return  # any other comment
     name = joint_name(column)
@@ -407,20 +404,17 @@ def _axis_positions(language: RobotLanguage, text: str, joints: dict[str, tuple[
         raise ValueError(f"{len(items)} positions, there must be {count}; complete them")
     else:
         pairs = list(zip((*language.arm, *language.external), items, strict=True))
-        absent = {"0", ABSENT_AXIS}
-        pairs = [(axis, item) for axis, item in pairs if axis in joints or item not in absent]
+        pairs = [(axis, item) for axis, item in pairs if axis in joints or item not in ("0", ABSENT_AXIS)]
     values = dict(pairs)
     if len(pairs) != len(joints) or values.keys() != joints.keys():
-        raise ValueError(
-            f"positions of the axes {', '.join(values)}, but comments name the joints of {', '.join(joints)}"
-        )
+        named = f"but comments name the joints of {', '.join(joints)}"
+        raise ValueError(f"positions of the axes {', '.join(values)}, {named}")
     return [_program_number(values[axis]) * unit for axis, (_, unit) in joints.items()]
 
 
 def _program_number(text: str) -> float:
     """Convert the text of a decimal number to a float; raise ValueError if the text is invalid or too long."""
-    if len(text) > INPUT_LIMITS.number_characters or not PROGRAM_NUMBER.fullmatch(text):
-        raise ValueError(
-            f"{text[:80]!r} is not a decimal number of at most {INPUT_LIMITS.number_characters} characters"
-        )
+    most = INPUT_LIMITS.number_characters
+    if len(text) > most or not PROGRAM_NUMBER.fullmatch(text):
+        raise ValueError(f"{text[:80]!r} is not a decimal number of at most {most} characters")
     return float(text)

@@ -37,13 +37,10 @@ from ocp.errors import ProblemError, require
 POSITION, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
 AXIS = ("ax", "ay", "az")
 KINDS = (POSITION, QUATERNION, VECTOR, AXIS, ("time",))
+SIGNS = ("", "_", ".")
 OTHER_NAMES = {
-    **{
-        f"{word}{sign}{axis}": axis for word in ("p", "pos", "position") for sign in ("", "_", ".") for axis in POSITION
-    },
-    **{
-        f"{word}{sign}{q[1]}": q for word in ("q", "quat", "orientation") for sign in ("", "_", ".") for q in QUATERNION
-    },
+    **{f"{word}{sign}{axis}": axis for word in ("p", "pos", "position") for sign in SIGNS for axis in POSITION},
+    **{f"{word}{sign}{q[1]}": q for word in ("q", "quat", "orientation") for sign in SIGNS for q in QUATERNION},
     **{f"{word}_{axis}": f"r{axis}" for word in ("r", "rot", "rotvec") for axis in POSITION},
     **dict(zip(("nx", "ny", "nz", "i", "j", "k"), AXIS * 2, strict=True)),
     **{f"{word}_{axis}": f"a{axis}" for word in ("a", "axis", "n", "normal") for axis in POSITION},
@@ -132,8 +129,7 @@ class Waypoints:
         """
         paths = self.paths(reversal="split" if reversal is None else reversal)
         if len(paths) > 1:
-            end = np.asarray(paths[0].segments[-1].end)
-            i = int(np.linalg.norm(self.positions - end, axis=1).argmin())
+            i = int(np.linalg.norm(self.positions - np.asarray(paths[0].segments[-1].end), axis=1).argmin())
             why = "the path reverses its direction; use paths(), which splits it there, or path(reversal=width in m)"
             raise line_error(self.file, int(self.lines[i]), self._description(i), why)
         return paths[0]
@@ -172,7 +168,6 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     """Read waypoints of a tool from a table, whose format the docstring of this module describes.
 
     Args:
-        file: Name of the file.
         unit: Unit of positions for which the header gives none: "m", "mm", "cm", "um" or "inch". None: m, with a
             warning if the values look like millimetres.
         columns: Names of the columns, used instead of the header if there is one; "" or "-" for a column to be ignored.
@@ -209,11 +204,9 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
         i = int(late.argmax())
         raise _row_error(file, rows, late, f"the time {times[i]:g} s is not after {times[i - 1]:g} s; sort the rows")
     positions = parts[POSITION]
-    if unit is None and not any(
-        _name_and_unit(cell)[1] for cell, name in zip(head, names, strict=True) if name in POSITION
-    ):
-        extent = np.ptp(positions, axis=0).max()
-        warn_of_millimetres(f"{file!s}: an extent of the waypoints of", extent, "unit")
+    units = [_name_and_unit(cell)[1] for cell, name in zip(head, names, strict=True) if name in POSITION]
+    if unit is None and not any(units):
+        warn_of_millimetres(f"{file!s}: an extent of the waypoints of", np.ptp(positions, axis=0).max(), "unit")
     orientations, axes = _orientations(file, parts, rows)
     used_names = tuple(name for name in names if any(name in kind for kind in parts))
     lines = np.array([row.number for row in rows])
@@ -282,9 +275,8 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
         else:
             units = {POSITION: LENGTHS, VECTOR: ANGLES, ("time",): TIMES}.get(kind, {})
             if unit_name is not None and unit_name not in units:
-                message = (
-                    f"{file}: the column {cell!r} cannot be in {unit_name}; known: {', '.join(units) or 'no unit'}"
-                )
+                known = ", ".join(units) or "no unit"
+                message = f"{file}: the column {cell!r} cannot be in {unit_name}; known: {known}"
                 raise ProblemError(message, name=name, value=unit_name, limit=tuple(units))
             if kind == POSITION:
                 if unit_name is not None and unit is not None and LENGTHS[unit_name] != LENGTHS[unit]:

@@ -101,9 +101,8 @@ def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
     if samples.accelerations is None or robot.total_mass == 0:
         return None
     q, v, a = (ca.SX.sym(name, robot.dof) for name in ("q", "v", "a"))
-    torque = torque_expression(machine, q, v, a)
-    torques: Array = Sampler([q, v, a], [torque])(samples.joints, samples.rates, samples.accelerations)[0]
-    return torques
+    sampler = Sampler([q, v, a], [torque_expression(machine, q, v, a)])
+    return sampler(samples.joints, samples.rates, samples.accelerations)[0]
 
 
 def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
@@ -125,9 +124,8 @@ def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
         joints_only = machine.momentum(b, q, ca.SX(len(machine.twist_rows), 1), v)
         angular_rows = 3 if machine.base_size == 7 else 1
         parts = [total[:angular_rows], total[angular_rows:], joints_only[:angular_rows], joints_only[angular_rows:]]
-        angular, linear, joints_angular, joints_linear = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])(
-            base, joints, rates, base_rates
-        )
+        sampler = Sampler([b, q, v, r], [ca.norm_2(part) for part in parts])
+        angular, linear, joints_angular, joints_linear = sampler(base, joints, rates, base_rates)
         for name, value, part, unit in (
             ("moment of momentum", angular, joints_angular, "N m s"),
             ("momentum", linear, joints_linear, "N s"),
@@ -176,9 +174,8 @@ def ground_contact(
             return GroundContact(corners, points, True), [margin]
     q, v, a = (ca.SX.sym(name, machine.joint_size) for name in ("q", "v", "a"))
     point = center_of_pressure(machine.ground_reaction(q, v, a))
-    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(
-        samples.joints, samples.rates, samples.accelerations
-    )
+    motion = samples.joints, samples.rates, samples.accelerations
+    points, margins = Sampler([q, v, a], [point, machine.support.margin(point)])(*motion)
     name = "zero moment point from the edge of the foot, without external forces"
     return GroundContact(corners, points, False), [Curve("Standing", name, "m", margins[:, 0], 0.0)]
 
@@ -296,9 +293,7 @@ def animate_solution(
     """Sample the solution of an optimal control problem for display.
 
     Args:
-        solution: The solution.
         machine: Machine whose joints, and base if it moves, are states of the problem.
-        name: Name of the motion.
         joints, base: Names of these states.
         settings: Settings of the audit.
 
@@ -420,9 +415,7 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """Return the integrated running cost of a problem and every entry of its path constraints, grouped by constraint,
-    as curves.
-    """
+    """Return the integrated running cost of a problem and all entries of its path constraints, by constraint."""
     if solution.problem is None:
         return []
     form = Formulation.of(solution.problem)
@@ -467,7 +460,6 @@ def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float)
     t = np.linspace(0.0, horizon, PAGE_SETTINGS.pair_samples)
     if len(pairs) < len(t):
         return None
-    points, distances, required = (
-        np.array([getattr(pair, name) for pair in pairs]) for name in ("points", "distance", "required")
-    )
+    names = ("points", "distance", "required")
+    points, distances, required = (np.array([getattr(pair, name) for pair in pairs]) for name in names)
     return ClosestPairs(t, points, distances, required, tuple(pair.bodies for pair in pairs))

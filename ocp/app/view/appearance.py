@@ -102,8 +102,7 @@ def appearance_of(
             color = SURFACE_STYLE.zone if has_visuals and not link.visuals else SURFACE_STYLE.grey
             triangles_of_link = _triangulate(link.collisions, folders, meshes, missing, color)
         surfaces += [(link.name, triangles) for triangles in triangles_of_link]
-    shown = {name for name, _ in surfaces}
-    surfaces += [(name, triangles) for name, triangles in _rods(robot, shown)]
+    surfaces += _rods(robot, {name for name, _ in surfaces})
     return Appearance(tuple(_parts(_limit_faces(surfaces, most))), missing)
 
 
@@ -199,8 +198,7 @@ def _limit_faces(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple
 
 def _merge_corners(mesh: Triangles, size: float) -> Triangles:
     """Merge the vertices of a mesh that lie in one grid cell into their mean, and remove degenerate faces."""
-    cells = np.floor(mesh.vertices / size).astype(np.int64)
-    _, cell = distinct_rows(cells)
+    _, cell = distinct_rows(np.floor(mesh.vertices / size).astype(np.int64))
     counts = np.bincount(cell)
     middles = np.stack([np.bincount(cell, column) for column in mesh.vertices.T], axis=1) / counts[:, None]
     faces = cell[mesh.faces]
@@ -274,9 +272,7 @@ TIP_FRAME = "the tip frame"
 
 @dataclass(frozen=True)
 class Frames:
-    """World poses of the links and of the tip along a motion, by link name or TIP_FRAME: rotation matrices (M, 3, 3)
-    and origins (M, 3), m.
-    """
+    """World poses of links and tip in a motion, by link name or TIP_FRAME: rotations (M, 3, 3), origins (M, 3), m."""
 
     rotations: dict[str, Array]
     positions: dict[str, Array]

@@ -18,7 +18,6 @@ from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from threading import Event, Thread
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -97,8 +96,7 @@ def build_page(
     head = json.dumps(description, allow_nan=False, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
     data_bytes = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
-    data = base64.b64encode(gzip.compress(data_bytes, 9, mtime=0)).decode()
-    text = _fill_template(name, shown[0], data)
+    text = _fill_template(name, shown[0], base64.b64encode(gzip.compress(data_bytes, 9, mtime=0)).decode())
     size, most = len(text.encode()), PAGE_SETTINGS.most_bytes
     if size > most:
         words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are allowed; show fewer motions"
@@ -269,9 +267,7 @@ class PageServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.shutdown()
         self._server.server_close()
 

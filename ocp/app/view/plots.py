@@ -126,8 +126,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
-    units = [joint.unit for joint in robot.moving_joints]
-    draw_joints(target, motions, plan.joint_bounds, names=names, units=units)
+    draw_joints(target, motions, plan.joint_bounds, names=names, units=[joint.unit for joint in robot.moving_joints])
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
     target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
     return target
@@ -214,9 +213,8 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
                     times, values = curve[name]
                     ax.plot(times, values[:, k], **line_style(number))
             lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            draw_limits(
-                ax, lower, upper, PICTURE_STYLE.flat * max(np.abs(c[name][1]).max() for c in curves if name in c)
-            )
+            largest = max(np.abs(curve[name][1]).max() for curve in curves if name in curve)
+            draw_limits(ax, lower, upper, PICTURE_STYLE.flat * largest)
             ax.set_title(name if own_widths[name] == 1 else f"{name} [{k}]")
             ax.set_ylabel(units.get(name, ""), fontsize=7)
             ax.margins(x=0.01)
@@ -301,8 +299,7 @@ def _figure(figure: Any, size: tuple[float, float]) -> Any:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)
     if figure.axes:
-        words = "plot: the figure already has axes; pass an empty one"
-        raise ProblemError(words, name="figure", value=figure)
+        raise ProblemError("plot: the figure already has axes; pass an empty one", name="figure", value=figure)
     figure.set_layout_engine("constrained")
     figure.set_size_inches(size)
     return figure

@@ -147,9 +147,7 @@ class Layer(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Horizontal ground with the lines of a square grid: height, m, middle (x, y), m, radius at which the ground fades
-    out, m, and grid spacing, m.
-    """
+    """Level ground with a square grid: height, middle (x, y), radius at which it fades out, and grid spacing, all m."""
 
     height: float
     middle: tuple[float, float]
@@ -189,8 +187,7 @@ def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
     inner = a < a.size - count
     a, b = a[inner], b[inner]
     faces = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
-    surface = (line[:, None] + radius * offsets).reshape(-1, 3)
-    return Part("", surface, offsets.reshape(-1, 3), faces, (*color, 1.0))
+    return Part("", (line[:, None] + radius * offsets).reshape(-1, 3), offsets.reshape(-1, 3), faces, (*color, 1.0))
 
 
 def render(

@@ -191,6 +191,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     if request is not None and isinstance(request.cost, Cost):
         cost += f", of {' and '.join(request.cost.terms)}"
     count = [f"{len(plan.candidates)} candidates"] if len(plan.candidates) > 1 else []
+    heading = f"Samples every {period:g} s against the limits"
     return Report(
         title,
         f"The plan {verdict.sentence}." + (f" It {verdict.margin}." if verdict.margin else ""),
@@ -199,10 +200,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
         draw_curves(motion, plan.joint_bounds, names=check.joints, units=units, faults=check.faults),
-        (
-            ("The audit", tuple(audit_rows(audit))),
-            (f"Samples every {period:g} s against the limits", check.limited_rows),
-        ),
+        (("The audit", tuple(audit_rows(audit))), (heading, check.limited_rows)),
         tuple(f"unlimited: {quantity}" for quantity in check.unlimited),
     )
 
@@ -275,9 +273,8 @@ def draw_curves(
         marks = [(place_of(time), f"{time:.6g}") for time in _round_numbers(motion.t[0], motion.t[-1])]
         for row, name in enumerate(names):
             curve = np.full(1, np.nan) if values is None else values[:, row]
-            view = limits_in_view(
-                float(curve.min()), float(curve.max()), float(lower[row]), float(upper[row]), min_range=min_range
-            )
+            ranges = float(curve.min()), float(curve.max()), float(lower[row]), float(upper[row])
+            view = limits_in_view(*ranges, min_range=min_range)
             scale = height / (view.high - view.low)
             parts.append(f'<g transform="translate({left + column * (width + gap):g} {top + row * pitch:g})">')
             ticks = [(height - scale * (value - view.low), f"{value:.6g}") for value in _round_numbers(*view[:2])]
@@ -289,9 +286,8 @@ def draw_curves(
                 parts.append(f'<path d="M0 {y:.1f}H{width:g}" style="stroke:{LIMIT};stroke-dasharray:5 2"/>')
             for fault in faults:
                 if fault.name == name and fault.kind == kind and fault.time is not None:
-                    parts.append(
-                        f'<path d="M{place_of(fault.time):.1f} 0v{height:g}" style="stroke:{FAULT};stroke-width:2"/>'
-                    )
+                    x = place_of(fault.time)
+                    parts.append(f'<path d="M{x:.1f} 0v{height:g}" style="stroke:{FAULT};stroke-width:2"/>')
             if values is not None:
                 points = np.column_stack([place_of(times), height - scale * (curve - view.low)]).tolist()
                 line = "L".join(f"{a:.1f} {b:.1f}" for a, b in points)
@@ -306,9 +302,8 @@ def draw_curves(
             if row == 0:
                 parts.append(f'<text class="middle title" x="{width / 2:g}" y="-6">{kind}</text>')
             if row == len(names) - 1:
-                parts += [
-                    f'<text class="middle" x="{place:.1f}" y="{height + 14:g}">{text}</text>' for place, text in marks
-                ]
+                y = height + 14
+                parts += [f'<text class="middle" x="{place:.1f}" y="{y:g}">{text}</text>' for place, text in marks]
                 parts.append(f'<text class="middle" x="{width / 2:g}" y="{height + 27:g}">time, s</text>')
             parts.append("</g>")
     size = f"0 0 {left + 3 * width + 2 * gap + 12:g} {top + len(names) * pitch + 16:g}"
@@ -333,10 +328,8 @@ def draw_scene(
     base = None if bases is None else interpolate(times, motion.t, bases)
     frames = frames_along(machine, motion.position.at(times), base)
     appearance = appearance_of(machine.robot, folders)
-    poses = [
-        parts_in_world(appearance, frames, int(k))
-        for k in np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)
-    ]
+    samples = np.linspace(0, PICTURE_STYLE.curve_points - 1, PICTURE_STYLE.poses)
+    poses = [parts_in_world(appearance, frames, int(k)) for k in samples]
     points = [part.vertices for parts in poses for part in parts]
     robot_points, static = np.vstack(points), []
     for obstacle in obstacles:
