@@ -148,7 +148,13 @@ def clearances(
 
 
 def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return the cost weight exp(-gap / width), which grows as the gap (m) between rig and obstacles closes."""
+    """Return the cost weight exp(-gap / width), which grows as the gap (m) between rig and obstacles closes.
+
+    Raises:
+        ModelError: The weight is negative or not finite, or the width is not positive.
+    """
+    require.nonnegative("clearance: weight", weight)
+    require.positive("clearance: width", width, unit="m")
     return weight * ca.exp(-gap / width)
 
 
