@@ -182,10 +182,8 @@ def _check_limits(scene: CollisionScene, joints: Variable) -> None:
     inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
     if scene.limits and not inside.all():
         name = robot.joint_names[int(np.flatnonzero(~inside)[0])]
-        words = (
-            f"the collision scene assumes joint {name!r} within its limits, but the problem does not limit it; "
-            "use CollisionScene(..., limits=False)"
-        )
+        words = f"the collision scene assumes joint {name!r} within its limits, but the problem does not limit it; use "
+        words += "CollisionScene(..., limits=False)"
         raise ProblemError(words, name=name)
 
 

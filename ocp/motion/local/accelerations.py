@@ -327,10 +327,8 @@ def resolve_accelerations(
 
     function = on_symbols(law_function)
     if not np.isfinite(np.array(function(0.0, joints, velocities)[0])).all():
-        words = (
-            f"law {law!r} has no accelerations at the start joints {joints.tolist()}: a task, the zero moment "
-            "point or a layer is singular there; start elsewhere or remove it"
-        )
+        words = f"law {law!r} has no accelerations at the start joints {joints.tolist()}: a task, the zero moment "
+        words += "point or a layer is singular there; start elsewhere or remove it"
         raise ProblemError(words, name="law", value=law, time=0.0)
     steps = max(int(np.ceil(duration / step - 1e-9)), 1)
     width, time, state = duration / steps, ca.MX.sym("time"), ca.MX.sym("state", 2 * n)

@@ -144,10 +144,8 @@ def resolve(
     checked_tasks(equations, base, joints, duration)
     times = _sample_times(samples, duration)
     if own.damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
-        words = (
-            f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
-            "start elsewhere, fix fewer rows, or give RateOptions(damping=...)"
-        )
+        words = f"{rows_dependent} is singular at the start joints {joints.tolist()}; start elsewhere, fix fewer rows, "
+        words += "or give RateOptions(damping=...)"
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
     model = on_symbols(lambda symbols: _Model(equations, rate_weights, own.damping, symbols))
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
@@ -248,10 +246,8 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
             usable = False
         if not usable:
             manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
-            reason = (
-                f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
-                f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
-            )
+            reason = f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
+            reason += f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
             return np.array(states_so_far), np.array(costs_so_far), reason
         states_so_far.append(state)
         costs_so_far.append(costs_so_far[-1] + cost)

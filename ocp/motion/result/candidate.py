@@ -317,10 +317,8 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
         if shares[k, index] > 1 + SINGULAR.at_limit:
             joint, time = request.machine.robot.moving_joints[index], float(sample.t[k])
             rate, limit = float(abs(sample.rates[k, index])), float(request.bounds.velocity[index])
-            words = (
-                f"at {time:.4g} s {joint.name!r} would have to move at {rate:.4g} {joint.unit}/s, its limit is "
-                f"{limit:.4g} {joint.unit}/s; lengthen the horizon or start elsewhere"
-            )
+            words = f"at {time:.4g} s {joint.name!r} would have to move at {rate:.4g} {joint.unit}/s, its limit is "
+            words += f"{limit:.4g} {joint.unit}/s; lengthen the horizon or start elsewhere"
             reasons.append((rate / limit, Reason(Rejection.INFEASIBLE, words, joint.name, rate, limit, time)))
     return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
 

@@ -340,10 +340,8 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
     at = int(jumps.argmax())
     if jumps[at] > 1e-9 * (1 + float(path.curvature(path.sample_distances()).max())):  # else rounding
         place, jump, owner = float(path.bounds[at + 1]), float(jumps[at]), "joint" if joints_limited else "tool"
-        message = (
-            f"a {owner} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
-            f"{jump:.3g} /m and the {owner} accelerations with it; round the corners with kind='quintic'"
-        )
+        message = f"a {owner} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by {jump:.3g} "
+        message += f"/m and the {owner} accelerations with it; round the corners with kind='quintic'"
         raise ProblemError(message, name="curvature", value=jump, time=place)
 
 

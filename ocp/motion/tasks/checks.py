@@ -117,10 +117,8 @@ def checked_tasks(
     rng = np.random.default_rng(0)
     configurations = [joints, *rng.normal(size=(5, len(joints)))]
     if not any(_has_full_rank(np.array(numeric(base, at))) for at in configurations):
-        words = (
-            f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they "
-            "prescribe a motion twice or one that the machine cannot make; leave out rows"
-        )
+        words = f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they "
+        words += "prescribe a motion twice or one that the machine cannot make; leave out rows"
         raise ProblemError(words, name="rows", value=rows)
     if not any(part.task.is_pose for part in equations.bound):
         return
@@ -138,11 +136,9 @@ def checked_tasks(
             residual = np.array(alone.pose_residual(base, joints, alone.target_function()(0.0)))
             gap = float(np.abs(residual).max())
             if gap > part.task.start_gap:
-                words = (
-                    f"at the start joints {joints.tolist()} the frame of {part.name!r} is {gap:.3g} (m or rad) away "
-                    f"from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
-                    "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
-                )
+                words = f"at the start joints {joints.tolist()} the frame of {part.name!r} is {gap:.3g} (m or rad) "
+                words += f"away from where its task begins, more than start_gap = {part.task.start_gap:g}; start from "
+                words += "inverse_kinematics(machine, task), or allow the gap for the feedback to close"
                 raise ProblemError(words, name=part.name, value=gap, limit=part.task.start_gap, time=0.0)
 
 
@@ -233,10 +229,8 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
             rotation = _rotation_angle(np.array(angular), times[1]) if turns else 0.0
             gap = max(float(np.abs(displacement).max(initial=0.0)), rotation)
         if gap > CHECKS.closed:
-            words = (
-                f"cyclic: the task of {part.name!r} is not closed: it ends {gap:.3g} (m or rad) "
-                "from where it began, and the joints cannot return; close the path"
-            )
+            words = f"cyclic: the task of {part.name!r} is not closed: it ends {gap:.3g} (m or rad) from where it "
+            words += "began, and the joints cannot return; close the path"
             raise ProblemError(words, name=part.name, value=gap, limit=CHECKS.closed)
 
 
@@ -244,10 +238,8 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
     """Raise ProblemError if a task prescribes motion at one of the times (s, or None) at which the joints must rest."""
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
-            words = (
-                f"the task of {part.name!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
-                "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
-            )
+            words = f"the task of {part.name!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where the "
+            words += "joints are to be at rest; let it come to rest there, or say 'free' for that end"
             raise ProblemError(words, name=part.name, value=velocity, limit=CHECKS.still, time=float(time))
 
 
@@ -276,10 +268,8 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         far = np.linalg.norm(positions - shoulder[task.linear], axis=1)
         worst = int(far.argmax())
         if far[worst] > reach:
-            words = (
-                f"the task of {part.name!r} leads {far[worst]:.4g} m away from the first joint at "
-                f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
-            )
+            words = f"the task of {part.name!r} leads {far[worst]:.4g} m away from the first joint at "
+            words += f"{times[worst]:.4g}, to {positions[worst].tolist()} m, but the arm is at most {reach:.4g} m long"
             raise ProblemError(words, name=part.name, value=float(far[worst]), limit=reach, time=float(times[worst]))
 
 
@@ -300,10 +290,8 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
         ):
             worst = int(speeds.argmax())
             if speeds[worst] > limit * (1 + CHECKS.closed):
-                words = (
-                    f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, "
-                    f"but joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
-                )
+                words = f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, but "
+                words += f"joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
                 details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
                 raise ProblemError(words, name=part.name, **details)
 

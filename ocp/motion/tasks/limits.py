@@ -151,10 +151,8 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
     for i in set(range(len(offsets))) - set(free):
         inside = float(ca.evalf(rows[i])) if external else float(normals[i] @ reachable - offsets[i])
         if inside < -ROUNDING_M:
-            words = (
-                f"the zero moment point is {-inside:.4g} m beyond an edge of the support, less its margin, in every "
-                "motion of the joints: move the foot below the machine"
-            )
+            words = f"the zero moment point is {-inside:.4g} m beyond an edge of the support, less its margin, in "
+            words += "every motion of the joints: move the foot below the machine"
             raise ProblemError(words, name="zero moment point", value=-inside, limit=0.0)
     return rows[free]
 
@@ -168,10 +166,8 @@ def constrained_axes(machine: Standing, zmp: IndexAtLeast, point: Any, external:
     reachable = machine.nearest_reachable(machine.most_stable_point)
     for i in {0, 1} - set(rows):
         if not low[i] - ROUNDING_M <= reachable[i] <= high[i] + ROUNDING_M:
-            words = (
-                f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {reachable[i]:.4g} m in every "
-                f"motion, outside {low[i]:.4g} .. {high[i]:.4g} m: move the foot below the machine"
-            )
+            words = f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {reachable[i]:.4g} m in "
+            words += f"every motion, outside {low[i]:.4g} .. {high[i]:.4g} m: move the foot below the machine"
             raise ProblemError(words, name="zero moment point", value=reachable[i], limit=(low[i], high[i]))
     return rows
 
@@ -193,10 +189,8 @@ def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
             raise ProblemError(words, name=name, value=place, time=float(time))
         inside = float(machine.support.margin(machine.nearest_reachable(place)))
         if inside < -ROUNDING_M:
-            words = (
-                f"{name}: {place.tolist()} m at {time:.4g} s is {-inside:.4g} m outside the support, where the machine "
-                "tips over; stay inside, or give another support"
-            )
+            words = f"{name}: {place.tolist()} m at {time:.4g} s is {-inside:.4g} m outside the support, where the "
+            words += "machine tips over; stay inside, or give another support"
             raise ProblemError(words, name=name, value=place, limit=machine.support.vertices, time=float(time))
 
 

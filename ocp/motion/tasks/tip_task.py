@@ -447,10 +447,8 @@ def base_independent_combinations(
     if np.any(np.asarray(machine.conserved_momentum)[linear:]):
         without_center = _combinations(task, len(task))
         if without_center.shape[1] < closing.shape[1]:
-            words = (
-                "cyclic: the linear momentum keeps moving the centre of mass, so the joints and a tip prescribed "
-                "in the world cannot both return to the start; define the task relative to the base"
-            )
+            words = "cyclic: the linear momentum keeps moving the centre of mass, so the joints and a tip prescribed "
+            words += "in the world cannot both return to the start; define the task relative to the base"
             raise ProblemError(words, name="cyclic", value=machine.conserved_momentum)
         closing = without_center
     return closing

@@ -334,10 +334,8 @@ class _Capture:
         place = ca.DM(self.tip_in_grasp(self.start.base, self.start.joints, self.start.target_base).position)
         distance, inside = float(ca.norm_2(place)), float(cone.inside(place))
         if inside < 0:
-            words = (
-                f"capture: the tip starts {distance:.4g} m from the grasp and {-inside:.4g} m outside the "
-                f"cone, which is open to all directions at {2 * cone.length:.4g} m; start farther away or inside it"
-            )
+            words = f"capture: the tip starts {distance:.4g} m from the grasp and {-inside:.4g} m outside the cone, "
+            words += f"which is open to all directions at {2 * cone.length:.4g} m; start farther away or inside it"
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def declare_second_phase(self, start: Mapping[str, Array] | None) -> Problem:

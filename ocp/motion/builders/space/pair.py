@@ -356,11 +356,9 @@ def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) ->
     angular = [k for k, row in enumerate(machine.twist_rows) if row < 3]
     size = float(np.linalg.norm(np.asarray(momentum)[angular]))
     if size > capacity * (1 + ROUNDING) + ROUNDING:
-        words = (
-            f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold at most "
-            f"{capacity:.6g}: {size - capacity:.6g} N m s are missing for rest. Use other wheels, more time, a "
-            "momentum of the chaser against that of the target, or rest=False"
-        )
+        words = f"capture: the pair has an angular momentum of {size:.6g} N m s, of which the wheels hold at most "
+        words += f"{capacity:.6g}: {size - capacity:.6g} N m s are missing for rest. Use other wheels, more time, a "
+        words += "momentum of the chaser against that of the target, or rest=False"
         raise ProblemError(words, name="momentum", value=size, limit=capacity)
 
 
@@ -375,11 +373,9 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
     closest = -(offset @ drift) / (drift @ drift) if drift.any() else earliest
     distance = float(np.linalg.norm(offset + drift * np.clip(closest, earliest, start.approach)))
     if distance > reach * (1 + ROUNDING):
-        words = (
-            f"capture: the centres of mass of chaser and target are at least {distance:.4g} m apart, and the arm "
-            f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. Start nearer, or let them drift "
-            "together"
-        )
+        words = f"capture: the centres of mass of chaser and target are at least {distance:.4g} m apart, and the arm "
+        words += f"reaches at most {reach:.4g} m: {distance - reach:.4g} m are missing. Start nearer, or let them "
+        words += "drift together"
         raise ProblemError(words, name="reach", value=distance, limit=reach)
 
 

@@ -282,10 +282,8 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     result = solver(x0=begin, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     left = float(np.abs(np.array(result["g"])).max(initial=0.0))
     if not left < CONFIGURATIONS.gap * 1e3:
-        words = (
-            f"no configuration within the joint limits puts the feet {list(stance.footholds)} on their footholds: the "
-            f"nearest one is {left:.3g} m or rad away; move the footholds, or start from other joints"
-        )
+        words = f"no configuration within the joint limits puts the feet {list(stance.footholds)} on their footholds: "
+        words += f"the nearest one is {left:.3g} m or rad away; move the footholds, or start from other joints"
         raise ProblemError(words, name="footholds", value=left, limit=CONFIGURATIONS.gap)
     return np.asarray(np.clip(np.array(result["x"]).ravel(), lower, upper))
 
@@ -298,10 +296,8 @@ def check_placed(stance: Stance, joints: Array) -> None:
     errors = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
     gap = float(np.abs(errors).max())
     if gap > PLACEMENT_TOLERANCE:
-        words = (
-            f"start: a foot is {gap:.3g} (m or rad) away from its foothold; "
-            "standing_configuration(stance, near) finds joints that put it there"
-        )
+        words = f"start: a foot is {gap:.3g} (m or rad) away from its foothold; standing_configuration(stance, near) "
+        words += "finds joints that put it there"
         raise ProblemError(words, name="start", value=gap, limit=PLACEMENT_TOLERANCE)
 
 

@@ -75,10 +75,8 @@ def check_slope(equations: TaskEquations, joints: Array) -> None:
     q = ca.SX.sym("q", len(joints))
     slope = ca.Function("slope", [q], [ca.gradient(equations.manipulability(ca.DM(0, 1), q), q)])
     if not np.isfinite(np.array(slope(joints))).all():
-        message = (
-            f"start {np.round(joints, 4).tolist()}: the task's rows are singular there, so that the "
-            "manipulability in the cost has no gradient; start elsewhere, or set Weights(manipulability=0)"
-        )
+        message = f"start {np.round(joints, 4).tolist()}: the task's rows are singular there, so that the "
+        message += "manipulability in the cost has no gradient; start elsewhere, or set Weights(manipulability=0)"
         raise ProblemError(message, name="start", value=joints)
 
 
@@ -121,10 +119,8 @@ def check_loads(
         return
     shares = zip(names, violations, strict=True)
     words = [f"{limit}, by {100 * share:.3g} %" for limit, share in shares if share > STARTS.violation]
-    message = (
-        f"start {np.round(joints, 4).tolist()}: no joint accelerations satisfy the limits there: "
-        f"{'; '.join(words)}; start elsewhere, load the tip less, or relax the limits"
-    )
+    message = f"start {np.round(joints, 4).tolist()}: no joint accelerations satisfy the limits there: "
+    message += f"{'; '.join(words)}; start elsewhere, load the tip less, or relax the limits"
     raise ProblemError(message, name="start", value=joints)
 
 

@@ -119,10 +119,8 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
     if first.support is not None:
         outside = steps.margin - float(first.support.margin(first.center_of_mass(own)[:2]))
         if outside > PLACEMENT_TOLERANCE:
-            words = (
-                f"start: the center of mass is {outside:.3g} m outside the support, less its margin; "
-                "standing_configuration(stance, near, over=...) finds joints in balance"
-            )
+            words = f"start: the center of mass is {outside:.3g} m outside the support, less its margin; "
+            words += "standing_configuration(stance, near, over=...) finds joints in balance"
             raise ProblemError(words, name="start", value=outside, limit=0.0)
     begin = steps.in_order(first, own[None])[0]
     guesses = first_guess(steps, begin, GUESSED_LIFT * steps.clearance)
