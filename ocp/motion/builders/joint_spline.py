@@ -24,6 +24,7 @@ from models.checks import NOT_NUMBERS, Array, floats
 from models.robot.dynamics import GRAVITY, inverse_dynamics
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import PathLike
+from ocp.motion.schedule.grid import subdivide
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -248,8 +249,7 @@ def _sample_places(path: Any, length: float, samples: int) -> Array:
     bounds = np.asarray(getattr(path, "bounds", (0.0, length)), dtype=float)
     shares = (samples - 1) * np.diff(bounds) / length
     counts = np.maximum(np.ceil(shares * (1 - ROUNDING_SHARE)), SPLINE.segment_samples).astype(np.intp)
-    inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.append(np.repeat(bounds[:-1], counts) + inside * np.repeat(np.diff(bounds) / counts, counts), length)
+    return subdivide(bounds, counts)
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:

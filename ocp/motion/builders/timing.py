@@ -29,6 +29,7 @@ from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.methods import solve
+from ocp.motion.schedule.grid import subdivide
 from ocp.motion.schedule.limits import (
     JointPath,
     LineLimits,
@@ -427,10 +428,3 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
     fractions = (mesh - begin) / (end - begin)
     fractions[0], fractions[-1] = 0.0, 1.0
     return np.asarray(fractions)
-
-
-def subdivide(nodes: Array, parts: NDArray[np.intp]) -> Array:
-    """Divide each of the N intervals of a mesh into a given number of equal parts; return the nodes of the new mesh."""
-    first = np.cumsum(parts) - parts
-    step = np.arange(parts.sum()) - np.repeat(first, parts)
-    return np.append(np.repeat(nodes[:-1], parts) + np.repeat(np.diff(nodes) / parts, parts) * step, nodes[-1])

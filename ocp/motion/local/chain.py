@@ -80,11 +80,6 @@ class SymbolicAxis(NamedTuple):
     point: Any
     revolute: bool
 
-    @classmethod
-    def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Convert a numeric joint axis to constant CasADi expressions, which symbolic rigid motions can transform."""
-        return cls(expression(direction), expression(point), revolute)
-
     def moved(self, motion: Frame) -> SymbolicAxis:
         """Return the axis transformed by a rigid motion."""
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
@@ -183,7 +178,7 @@ class Chain:
         joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
         frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
         for j in self.order:
-            axis = SymbolicAxis.of(self.axes[j], self.points[j], bool(self.revolute[j]))
+            axis = SymbolicAxis(expression(self.axes[j]), expression(self.points[j]), bool(self.revolute[j]))
             moved.append(axis.moved(frame))
             frame = compose(frame, axis.frame(joints[j]))
         tip = compose(frame, self.home)

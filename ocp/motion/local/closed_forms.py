@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from models.cts.trigonometric import Harmonics, polish, roots, square_of_first_harmonic
-from models.spatial import Frame, cross, rotation_matrices
+from models.spatial import Frame, cross, expression, rotation_matrices
 from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse
 from ocp.problem.values import Sampler
 
@@ -139,7 +139,7 @@ class ClosedForm(PoseSolver):
         if self.kind == "meeting":
             points[list(self.triple)] = _meeting_point(chain, self.triple)[0]
         for j in chain.order:
-            axis = SymbolicAxis.of(chain.axes[j], points[j], bool(chain.revolute[j]))
+            axis = SymbolicAxis(expression(chain.axes[j]), expression(points[j]), bool(chain.revolute[j]))
             if j in self.redundant:
                 fixed = compose(fixed, axis.frame(symbols[self.redundant.index(j)]))
             else:
@@ -286,7 +286,8 @@ def _pair_solver() -> Any:
     sizes = larger + smaller + TINY, larger - smaller
     sum_angle, difference_angle = ca.atan2(shear, difference), ca.atan2(turn, mean)
     left, right = (difference_angle + sum_angle) / 2, (difference_angle - sum_angle) / 2
-    rotated = ca.mtimes(_rotation(left).T, ca.horzcat(a, c))
+    cosine, sine = ca.cos(left), ca.sin(left)
+    rotated = ca.mtimes(ca.vertcat(ca.horzcat(cosine, sine), ca.horzcat(-sine, cosine)), ca.horzcat(a, c))
     equations = [(rotated[i, 2], -rotated[i, 0], -rotated[i, 1]) for i in (0, 1)]
     singular = ca.fabs(sizes[1]) <= FORMS.straight * sizes[0]
     share = sizes[1] / sizes[0]
@@ -311,12 +312,6 @@ def _pair_solver() -> Any:
     determination = ca.fmin(ca.if_else(singular, linear, largest), sizes[0])
     outputs = [ca.vertcat(*part) for part in (firsts, seconds, residuals)]
     return ca.Function("pairs", [a, b, c], [*outputs, determination])
-
-
-def _rotation(angle: Any) -> Any:
-    """Return the 2 x 2 matrix of a rotation by an angle, as an expression."""
-    cosine, sine = ca.cos(angle), ca.sin(angle)
-    return ca.vertcat(ca.horzcat(cosine, -sine), ca.horzcat(sine, cosine))
 
 
 def _close_roots(f: Harmonics) -> Any:

@@ -53,18 +53,15 @@ PHRASES: dict[str, tuple[str, float, str]] = {
            "collision shapes of the link that carries the tip"),
 }  # fmt: skip
 """Text about the size of each uncertainty, factor to the unit of the text, and what to do if no limit depends on it."""
-LOADS = (PAYLOAD, FRICTION)
-"""Names of the uncertainties that change torques; the others are misplacements."""
-UNCERTAINTIES = tuple(PHRASES)
-"""Names of the uncertainties, see `ocp.motion.result.plan.Plan.margin`."""
+LOADS = (PAYLOAD, FRICTION)  # names of the uncertainties that change torques; the others are misplacements
+UNCERTAINTIES = tuple(PHRASES)  # names of the uncertainties, see `ocp.motion.result.plan.Plan.margin`
 SAMPLES_PER_STEP = 8
 """Smallest number of intervals between two sample times of a plan at whose ends torques are evaluated: twice the degree
 of the polynomials that `plan` uses. There are at least CHECKED_TIMES intervals in all."""
 INSIDE = 1e-9
 """Distance of the first and last of these samples from the ends of the step, where accelerations may jump, as a share
 of the step."""
-DIGITS = 2
-"""Number of significant digits of a margin in a sentence, rounded down."""
+DIGITS = 2  # number of significant digits of a margin in a sentence, rounded down
 TIGHTENING_SHARE = 0.01
 """Share by which torque limits of robust plans are tightened more than estimated, so that few motions are planned."""
 PYRAMID_SIDES = 32

@@ -27,10 +27,8 @@ from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.solution import Solution
 from ocp.tolerances import CLEARANCE_TOLERANCE_M, RESOLVED_SHARE
 
-POSE_TOLERANCE = 1e-6
-"""Largest pose error at a waypoint, m and rad."""
-STEP_TOLERANCE = 1e-6
-"""Largest excess over a joint limit or over the largest step between waypoints, rad or m."""
+POSE_TOLERANCE = 1e-6  # largest pose error at a waypoint, m and rad
+STEP_TOLERANCE = 1e-6  # largest excess over a joint limit or over the largest step between waypoints, rad or m
 UNLIMITED_RATE = 1.0
 """Rate that is assumed for joints without velocity limits when a path is timed or compared, rad/s or m/s."""
 SAVED = "cost that displacements would save"

@@ -38,10 +38,8 @@ from ocp.solution_data import call_registered, read_head
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 
-ENDS = "speed at both ends"
-"""Name of the audit finding that tells whether a motion starts and ends at rest."""
-CHECKED_TIMES = 2001
-"""Number of samples at which joint limits are checked, besides the times of the plan."""
+ENDS = "speed at both ends"  # name of the audit finding that tells whether a motion starts and ends at rest
+CHECKED_TIMES = 2001  # number of samples at which joint limits are checked, besides the times of the plan
 Rows: TypeAlias = NDArray[np.intp]
 
 

@@ -143,9 +143,7 @@ def declared_motion(
     """Declare the problem of a request, and store the request in the problem, so that files can rebuild the problem.
 
     Args:
-        request: The request.
-        start, reference, constraints: As in `ToolMotionSetup`.
-        actuation, relaxed: As in `ToolMotionSetup`.
+        start, reference, constraints, actuation, relaxed: As in `ToolMotionSetup`.
     """
     options: dict[str, Any] = {
         "base": request.base,
@@ -185,8 +183,7 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
     "capture": capture_problem,
     "joint motion": joint_motion_problem,
 }
-MACHINE_NAMES = ("machine", "chaser")
-"""Names of the builder arguments that hold the machine."""
+MACHINE_NAMES = ("machine", "chaser")  # names of the builder arguments that hold the machine
 
 
 def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:

@@ -29,12 +29,9 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
 RATES = ("rates", SLOPES, "velocities")
-PHASED = "plan.phased"
-"""Name of the array whose presence marks the file of a plan with several phases."""
-PHASED_RATES = "velocities"
-"""Name of the joint rates in the solution of a problem of several phases."""
-TARGET_TIMES = 401
-"""Number of times at which a plan stores the target poses of its tasks."""
+PHASED = "plan.phased"  # name of the array whose presence marks the file of a plan with several phases
+PHASED_RATES = "velocities"  # name of the joint rates in the solution of a problem of several phases
+TARGET_TIMES = 401  # number of times at which a plan stores the target poses of its tasks
 
 
 class Part(NamedTuple):

@@ -37,8 +37,7 @@ from ocp.problem.hulls import Frames, frames_of
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 Indices = NDArray[np.intp]
-COMPARED_PLACES = 32
-"""Number of fractions of their length at which two paths are compared."""
+COMPARED_PLACES = 32  # number of fractions of their length at which two paths are compared
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,8 @@ from ocp.motion.sampling.joint_paths import (
 Indices = NDArray[np.intp]
 
 
-TREE_BATCH = 16
-"""Number of random configurations towards which a tree grows at once."""
-LONGEST_EDGE_SHARE = 0.05
-"""Longest edge of a tree, as a share of the diagonal of the sampled range of configurations."""
+TREE_BATCH = 16  # number of random configurations towards which a tree grows at once
+LONGEST_EDGE_SHARE = 0.05  # longest edge of a tree, as a share of the diagonal of the sampled range of configurations
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +191,6 @@ def find_paths(
         search: Start, goals, proofs of clearance, sampled range and metric.
         limits: Lower and upper limits of the joints. Shape (n,) each.
         seed: Seed of the random searches.
-        settings: Settings.
 
     Raises:
         TimeLimitReached: The time limit has passed before a path was found.

@@ -150,7 +150,6 @@ def optimal_motion_near(
         path: Configurations with straight motions between them. Shape (M, n).
         cost: The cost, see `has_spline_cost`. It must weight time if the horizon is free.
         horizon: Duration, s; None if it is free.
-        settings: Settings.
 
     Raises:
         SolveError: No motion within the limits was found near the path.

@@ -334,6 +334,12 @@ def node_minimum(of_intervals: Array) -> Array:
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
+def subdivide(nodes: Array, parts: NDArray[np.intp]) -> Array:
+    """Divide each of the N intervals of a mesh into a given number of equal parts; return the nodes of the new mesh."""
+    step = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    return np.append(np.repeat(nodes[:-1], parts) + np.repeat(np.diff(nodes) / parts, parts) * step, nodes[-1])
+
+
 def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
     for _ in range(2 * SETTINGS.halvings):
@@ -358,8 +364,7 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
     longest = np.minimum(speed * duration, length)
     # ceil with a margin for rounding: the unit of length must not change the nodes
     parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
-    index = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
-    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * index, length)
+    nodes = subdivide(s, parts)
     if unlimited:  # the squared speed grows in proportion to the distance from rest
         return nodes
     near: list[Array] = [np.zeros(0), np.zeros(0)]

@@ -266,14 +266,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
     rates = joints.at(distance)
     shape = (len(distance), len(joints.names))
     for kind in ("position", "first", "second", "third"):
-        try:
-            value = floats(getattr(rates, kind))
-        except (AttributeError, *NOT_NUMBERS) as error:
-            message = f"joints along the path: {kind} is missing or not numeric: {error}"
-            raise ProblemError(message, name=kind, value=getattr(rates, kind, None)) from error
-        if value.shape != shape:
-            message = f"joints along the path: {kind} has shape {value.shape}, expected {shape}"
-            raise ProblemError(message, name=kind, value=value.shape, limit=shape)
+        value = require.array(f"joints along the path: {kind}", getattr(rates, kind, None), shape, entries="any")
         finite = np.isfinite(value)
         if not finite.all():
             at, joint = np.argwhere(~finite)[0]
@@ -287,10 +280,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
     """Return a path's curvature at distances (M,), 1/m; raise ProblemError for a wrong shape or non-finite values."""
-    value = np.asarray(path.curvature(distance), dtype=float)
-    if value.shape != np.shape(distance):
-        message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
-        raise ProblemError(message, name="curvature", value=value.shape, limit=np.shape(distance))
+    value = require.array("path: curvature", path.curvature(distance), np.shape(distance), entries="any")
     if not np.isfinite(value).all():
         at = int((~np.isfinite(value)).argmax())
         message = f"the path's curvature is {value[at]:g}, not finite, at {distance[at]:g} m: a cusp"
@@ -310,10 +300,7 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
     torques: TorqueRates = joints.torques(distance)  # type: ignore[attr-defined]
     shape = len(distance), len(joints.names)
     for kind in ("inertia", "drag", "rest"):
-        value = np.asarray(getattr(torques, kind), dtype=float)
-        if value.shape != shape or not np.isfinite(value).all():
-            message = f"torques along the path: {kind} must be finite and of shape {shape}, it has {value.shape}"
-            raise ProblemError(message, name=kind, value=value.shape, limit=shape)
+        require.array(f"torques along the path: {kind}", getattr(torques, kind, None), shape)
     return torques
 
 

@@ -272,7 +272,6 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
     Args:
         path: A models.paths.SmoothPath, or any PathLike.
-        limits: The limits.
         joints: The joints along the path; required with limits.joints.
         strict: Raise an error instead of reducing the speed.
 

@@ -39,11 +39,9 @@ Memory = MutableMapping[tuple[float, ...], Phases]
 NO_INERTIA = 1e-12
 """Coefficient of the acceleration, over the largest of all rows, below which a row does not limit the acceleration."""
 
-UNBOUNDED = 1e300
-"""Bound of an acceleration that is not limited; finite, so that its multiple by 0 is 0."""
+UNBOUNDED = 1e300  # bound of an acceleration that is not limited; finite, so that its multiple by 0 is 0
 
-ACTIVE_USAGE = 0.1
-"""Share of a limit below which its part at a steady speed cannot make it active in a short interval."""
+ACTIVE_USAGE = 0.1  # share of a limit below which its part at a steady speed cannot make it active in a short interval
 
 REACH_MARGIN = 1e-6
 """Fraction of a zone (stretch with constant limits) kept in reserve, so that a motion through the zone is feasible."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.checks import NOT_NUMBERS, Array, floats
+from models.checks import Array, floats
 from models.files import read_regular
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
@@ -46,17 +46,12 @@ class JointTrajectory:
             message = f"trajectory: joint names {list(names)} must be given and distinct"
             raise ProblemError(message, name="names", value=names)
         object.__setattr__(self, "names", names)
-        t = _numbers("times", self.t)
-        if t.ndim != 1 or not t.size or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise ProblemError("trajectory: times must be finite, increasing, and at least one", name="times", value=t)
+        t = require.array("trajectory: times", self.t, ("times",))
+        if (np.diff(t) <= 0).any():
+            raise ProblemError("trajectory: times must be increasing", name="times", value=t)
         object.__setattr__(self, "t", t)
         for kind in KINDS:
-            values = _numbers(kind, getattr(self, kind))
-            if values.shape != (shape := (len(t), len(names))):
-                message = f"trajectory: {kind} have shape {values.shape}, expected {shape}"
-                raise ProblemError(message, name=kind, value=values.shape, limit=shape)
-            if not np.isfinite(values).all():
-                raise ProblemError(f"trajectory: {kind} are not all finite", name=kind, value=values)
+            values = require.array(f"trajectory: {kind}", getattr(self, kind), (len(t), len(names)))
             object.__setattr__(self, kind, values)
 
     def __repr__(self) -> str:
@@ -124,14 +119,6 @@ class JointTrajectory:
             text = f"this is not a joint trajectory message: {error!r}"
             raise ProblemError(text, name="message", value=message) from error
         return cls(names, t, *values)
-
-
-def _numbers(what: str, value: Any) -> Array:
-    """Return a value as an array of floats; raise ProblemError if it is not numeric."""
-    try:
-        return floats(value)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"trajectory: {what} are not numeric: {value!r}", name=what, value=value) from error
 
 
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:

@@ -103,7 +103,7 @@ class TaskEquations:
                 parts += [value, pace * velocity]
             if task.orientation is not None:
                 value = expression_of("orientation", (4, 1), (3, 3))
-                rotation = _rotation_of(value) if value.shape == (4, 1) else value
+                rotation = on_scalars(rotation_from_quaternion)(value) if value.shape == (4, 1) else value
                 if hasattr(task.orientation, "rate"):
                     angular = expression_of("orientation", (3, 1), rate=True)
                 else:
@@ -408,12 +408,6 @@ def _whole(task: TipTask, value: Any) -> Any:
 def _derivative(value: Any, time: Any) -> Any:
     """Return the time derivative of an expression as a dense matrix, zero for a constant."""
     return ca.densify(ca.jacobian(value, time)) if isinstance(value, ca.SX | ca.MX) else ca.DM.zeros(*value.shape)
-
-
-@on_scalars
-def _rotation_of(quaternion: Any) -> Any:
-    """Return the rotation matrix of a quaternion, computed on scalar symbols."""
-    return rotation_from_quaternion(quaternion)
 
 
 @on_scalars

@@ -166,8 +166,7 @@ class Waypoints:
     __repr__ = short_repr
 
 
-PER_JOINT = ("effort", "acceleration")
-"""Terms of the cost that may have a weight for each joint."""
+PER_JOINT = ("effort", "acceleration")  # terms of the cost that may have a weight for each joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +232,7 @@ class Cost:
         return f"Cost({weighted}{'' if self.weights is None else f', weights={self.weights!r}'})"
 
 
-TERMS = tuple(term.name for term in fields(Cost) if term.name != "weights")
-"""Names of all terms of the cost."""
+TERMS = tuple(term.name for term in fields(Cost) if term.name != "weights")  # names of all terms of the cost
 
 
 @dataclass(frozen=True, eq=False)
