@@ -232,12 +232,10 @@ def barrier_options(problem: Problem, mesh: Collocation, cost: float, options: M
     limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier alone
     determines the result: a motion far away from all limits.
     """
-    limits = [(each.lower, each.upper) for each in problem.declared.states.values()]
-    limits += [(each.lower, each.upper) for each in problem.declared.controls.values()]
-    limits += [(each.lower, each.upper) for each in problem.declared.path.values()]
-    limit_count = 0
-    for low, high in ((constant(low), constant(high)) for low, high in limits):
-        limit_count += int(np.isfinite(np.array([low, high])[:, low < high]).sum())
+    declared = problem.declared
+    bounded: list[Any] = [*declared.states.values(), *declared.controls.values(), *declared.path.values()]
+    limits = [np.array([constant(each.lower), constant(each.upper)]) for each in bounded]
+    limit_count = sum(int(np.isfinite(pair[:, pair[0] < pair[1]]).sum()) for pair in limits)
     if not np.isfinite(cost) or not limit_count:
         return dict(options)
     largest, (default, smallest) = cost / (limit_count * mesh.intervals * mesh.degree), BARRIERS

@@ -59,10 +59,9 @@ def joint_motion_problem(
     bounds, n = (limits or Limits()).bounds(machine, ("velocity",)), machine.joint_size
     ends = []
     for name, value in (("start", start), ("end", end)):
+        words: dict[str, Any] = {"label": name, "names": machine.robot.joint_names, "hint": "keep within them"}
         joints, _ = checked_configuration(machine, value, None)
-        hint = "keep within them"
-        names = machine.robot.joint_names
-        ends.append(clip_to_limits(joints, bounds.lower, bounds.upper, label=name, names=names, hint=hint))
+        ends.append(clip_to_limits(joints, bounds.lower, bounds.upper, **words))
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
     problem.horizon(require.positive("horizon", horizon))

@@ -212,7 +212,8 @@ def _halve_intervals(
     at_rest = s[0] == 0, s[-1] == path.length
     for number in range(SETTINGS.halvings + 1):
         begin, end, width = rows.take(left), rows.take(right), np.diff(s)
-        top = _steady_speeds(begin, end, (s[:-1] + s[1:]) / 2, *requested)
+        most = requested[1][segment_index(requested[0], (s[:-1] + s[1:]) / 2)]
+        top = np.minimum(np.minimum(begin.steady()[0], end.steady()[0]), most)  # fastest steady speed
         rates = acceleration_bounds(begin, end, top**2, top**2)
         if number == SETTINGS.halvings or not new.size:
             break
@@ -267,15 +268,6 @@ def _separate(places: Array, nodes: Array) -> Array:
             break
         s = s[~close]
     return s
-
-
-def _steady_speeds(begin: Rows, end: Rows, inside: Array, bounds: Array, requested: Array) -> Array:
-    """Return the fastest constant speed permitted in each interval, not above the requested speed. Shape (N,), m/s.
-
-    `begin` and `end` are the limits at its ends, and `inside` is a distance in each interval.
-    """
-    steady = np.minimum(begin.steady()[0], end.steady()[0])
-    return np.asarray(np.minimum(steady, requested[segment_index(bounds, inside)]))
 
 
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:

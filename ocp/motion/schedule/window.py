@@ -311,7 +311,9 @@ def limit_usage(
         for side, value in zip(used, (peak, -peak), strict=True):
             side[at_row] = np.maximum(side[at_row], value)
     if closely:
-        missed = _inaccurate_rows(window.bends if every else window.bends.take(which), used, (first, met, last))
+        bends = window.bends if every else window.bends.take(which)
+        error = bends.usage(LineMotion(*np.abs((first, met, last)).max(axis=0)))
+        missed = (error > SETTINGS.bend) & (used.max(axis=0) + error > 1)
         inaccurate, by_torques = missed.any(axis=1), missed[:, window.torques].any(axis=1)
         for torques, these in ((False, np.flatnonzero(inaccurate & ~by_torques)), (True, np.flatnonzero(by_torques))):
             if these.size:
@@ -337,12 +339,6 @@ def _parabola_errors(rows: list[Array]) -> Array:
     a, b, c, d, e = rows
     # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
-
-
-def _inaccurate_rows(bends: Rows, used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return which limits a motion may exceed within the errors of interpolation. Shape (N, K + L + P)."""
-    error = bends.usage(LineMotion(*np.abs(motions).max(axis=0)))
-    return np.asarray((error > SETTINGS.bend) & (used.max(axis=0) + error > 1))
 
 
 def _fine_usage(

@@ -96,7 +96,9 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
     sampler = Sampler([time], [equations.target_function()(time)])
     inner = breaks[:-1, None] + np.diff(breaks)[:, None] * np.arange(NODES.samples) / NODES.samples
     values = sampler(inner.reshape(-1, 1))[0]
-    largest = _largest_errors(equations, values)
+    largest = np.full(values.shape[1], NODES.pose_error)
+    for rates in _target_rows(equations)[1]:
+        largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
     points = np.array(ca.collocation_points(NODES.points, "radau"))
     ends, open_intervals = {0, len(breaks) - 1}, [(0, len(breaks) - 1)]
     while open_intervals:
@@ -141,14 +143,6 @@ def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
             rates.append(slice(at + rate.start, at + rate.stop))
         at += part.target_size
     return poses, rates
-
-
-def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the permitted interpolation error of each target value, given samples (M, size). Shape (size,)."""
-    largest = np.full(values.shape[1], NODES.pose_error)
-    for rates in _target_rows(equations)[1]:
-        largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
-    return largest
 
 
 def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]:

@@ -116,9 +116,8 @@ def _extensible_problem(
     )
     slower = replace(steps, phases=tuple(phases))
     problem = steps_problem(slower, start=start, **{**step_options, "cost": weights})
-    problem.minimize(
-        0, PACE.price * default.acceleration * sum(problem[name].duration / each for name, each in seconds.items())
-    )
+    extension = sum(problem[name].duration / each for name, each in seconds.items())
+    problem.minimize(0, PACE.price * default.acceleration * extension)
     return problem
 
 
@@ -234,10 +233,8 @@ def solve_standing(
     judge = partial(_audited, solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
     timed = not (isinstance(horizon, FreeTime) or along_parameter)
     breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
-    trials = [
-        (level, mesh.with_nodes_at(breaks))
-        for level, mesh in _formulations(setup.control, isinstance(horizon, FreeTime), solving.method)
-    ]
+    formulations = _formulations(setup.control, isinstance(horizon, FreeTime), solving.method)
+    trials = [(level, mesh.with_nodes_at(breaks)) for level, mesh in formulations]
 
     def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
         def declare(level: Level | None) -> Problem:
@@ -269,16 +266,12 @@ def solve_steps(
     """
     solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     require.instance("solve_steps: steps", steps, Steps)
-    guess = guess_in_time(steps, start, {"cost": cost, "limits": limits}, solving.ipopt_options)
+    options: dict[str, Any] = {"cost": cost, "limits": limits}
+    guess = guess_in_time(steps, start, options, solving.ipopt_options)
+    options["start"] = start
     judge = partial(_audited, solving.tolerances, lambda _: None)
     trials: list[Trial] = [(None, solving.method or STEPS)]
-    return _first_accepted(
-        lambda _: steps_problem(steps, start=start, cost=cost, limits=limits),
-        trials,
-        solving.ipopt_options,
-        judge,
-        guess,
-    )
+    return _first_accepted(lambda _: steps_problem(steps, **options), trials, solving.ipopt_options, judge, guess)
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:

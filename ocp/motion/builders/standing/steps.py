@@ -40,7 +40,7 @@ from ocp.motion.builders.standing.stances import (
 from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.local.rates import resolve
 from ocp.motion.tasks.checks import rates_at_rest
-from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import pose_line
 from ocp.problem.phases import Phases
@@ -141,7 +141,9 @@ def _declare_phase(
 ) -> Problem:
     """Declare the problem of phase k of `steps_problem`, in which some feet are held and others swing."""
     phase, stance, last = steps.phases[k], steps.stances[k], k + 1 == len(steps.phases)
-    robot, n, bounds = stance.robot, stance.joint_size, _stance_bounds(steps, stance, limits)
+    robot, n = stance.robot, stance.joint_size
+    limits.bounds(stance)  # checks the number of their entries, before these are reordered
+    bounds = limits.of_joints(steps.order(stance)).bounds(stance, ("velocity", "torque"))
     problem = Problem(steps.names[k])
     final = declare_horizon(problem, phase.duration)
     none, equations = ca.DM(0, 1), foothold_equations(stance) if stance.other_feet else None
@@ -177,12 +179,6 @@ def _declare_phase(
     running += weights.load * sum(ca.sumsqr(load / stance.weight) for load in loads.values())
     problem.minimize(running=running, terminal=weights.time * final if isinstance(phase.duration, FreeTime) else 0)
     return problem
-
-
-def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> JointBounds:
-    """Return the limits of joints and actuators, reordered from the robot's joint order to that of a stance."""
-    limits.bounds(stance)  # checks the number of their entries
-    return limits.of_joints(steps.order(stance)).bounds(stance, ("velocity", "torque"))
 
 
 def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:
@@ -221,7 +217,10 @@ def _constrain_swing(
         ground = before + (after - before) * rest_to_rest(risen)
         least = clearance * ((1 + GROUND_TOLERANCE) * height - GROUND_TOLERANCE)
         heights = stance.sole_corners(swing.name, joints)[2, :].T - ground - least
-        problem.path(f"{swing.name} clearance", heights[_distinct_rows(heights, joints)], lower=0.0, unit="m")
+        values = _at_random(heights, joints)
+        # rows of sole corners coincide in planar machines
+        distinct = [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
+        problem.path(f"{swing.name} clearance", heights[distinct], lower=0.0, unit="m")
     if swing.landing is not None:
         equations = foothold_equations(stance, {swing.name: swing.landing})
         none, targets = ca.DM(0, 1), ca.DM(equations.target_function()(0.0))
@@ -229,12 +228,6 @@ def _constrain_swing(
         problem.end(f"{swing.name} landing", gap, lower=0.0, upper=0.0, unit=equations.unit(""))
         speed = equations.twist(none, joints, rates)
         problem.end(f"{swing.name} landing speed", speed, lower=0.0, upper=0.0, unit=equations.unit())
-
-
-def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of the distinct rows of a constraint; rows of sole corners coincide in planar machines."""
-    values = _at_random(rows, joints)
-    return [i for i in range(len(values)) if not any(np.allclose(values[i], values[j]) for j in range(i))]
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
