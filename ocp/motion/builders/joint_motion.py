@@ -85,13 +85,11 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible. The
     length of a displacement is |scale * dq|, with the roots (n,) of the weights.
     """
-    changes = np.diff(path, axis=0)
-    lengths = np.linalg.norm(changes * scale, axis=1)
+    lengths = np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)
     moves = lengths > 0
     path = np.vstack([path[:-1][moves], path[-1:]]) if moves.any() else path[[0, -1]]
     total = float(lengths.sum())
-    shares = lengths[moves] / total if moves.any() else np.ones(1)
-    breaks = np.append(0.0, np.cumsum(shares))
+    breaks = np.append(0.0, np.cumsum(lengths[moves] / total if moves.any() else np.ones(1)))
     breaks[-1] = 1.0
     rates = np.diff(path, axis=0) / (np.diff(breaks)[:, None] * horizon)
     # the costates of a motion without active constraints: minus the rate gradient of the running cost

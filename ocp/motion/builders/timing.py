@@ -424,7 +424,6 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * beside]
     nodes = distinct(np.concatenate([[begin, end], sides, changes]), TIMING.same_node * whole)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
-    mesh = subdivide(nodes, parts)
-    fractions = (mesh - begin) / (end - begin)
+    fractions = (subdivide(nodes, parts) - begin) / (end - begin)
     fractions[0], fractions[-1] = 0.0, 1.0
     return np.asarray(fractions)

@@ -144,8 +144,7 @@ def largest_changes(
                 poses = [_relative_pose(each, index[chosen], hull.frame, observer) for each in ends]
                 rotation, speed = ((first - last) / (2 * step) for first, last in zip(*poses, strict=True))
                 moved = hull.core @ rotation.transpose(0, 2, 1) + speed[:, None]
-                fastest = np.linalg.norm(moved, axis=2).max(axis=1)
-                changes[chosen] += reach[at[chosen], axis] * fastest
+                changes[chosen] += reach[at[chosen], axis] * np.linalg.norm(moved, axis=2).max(axis=1)
     return np.asarray(np.minimum(changes, (arms * spans).sum(axis=1)))
 
 
@@ -216,8 +215,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
         base, joints = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)
         time = ca.SX.sym("time")
         placements = Sampler([base, joints, time], [ca.SX(scene.placements(base, joints, time))])
-        hulls = tuple(scene_hulls(scene).values())
-        cached = placements, BodyPairs(hulls, scene.pairs, scene.covers)
+        cached = placements, BodyPairs(tuple(scene_hulls(scene).values()), scene.pairs, scene.covers)
         scene.__dict__["_prepared"] = cached
     return cached
 

@@ -222,8 +222,7 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
     remaining = _coefficients(local[4:1:-1], local[5].point, c.direction)
     point, direction = (goal.at(c.point) - center) / size, goal.rotate(c.direction)
     inverted = [axis._replace(direction=-axis.direction) for axis in local[:2]]
-    eliminated = _coefficients(inverted, point, direction)
-    left, values, _ = np.linalg.svd(eliminated.reshape(len(point), 15, 9))
+    left, values, _ = np.linalg.svd(_coefficients(inverted, point, direction).reshape(len(point), 15, 9))
     return left, (values > ELIMINATION.rank * values[:, :1]).sum(axis=1), remaining
 
 

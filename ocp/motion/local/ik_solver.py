@@ -384,8 +384,7 @@ def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
     """Return a user's tip positions (N, 3) and rotations (N, 3, 3); raise ProblemError if they are invalid."""
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
-    single = places.ndim == 1
-    places, turns = (places[None], turns[None]) if single else (places, turns)
+    places, turns = (places[None], turns[None]) if places.ndim == 1 else (places, turns)
     if places.ndim != 2 or places.shape[1] != 3 or turns.shape != (len(places), 3, 3):
         words = f"poses have shapes {places.shape} and {turns.shape}, (N, 3) and (N, 3, 3) expected"
         raise ProblemError(words, name="rotations", value=turns.shape, limit=(len(places), 3, 3))

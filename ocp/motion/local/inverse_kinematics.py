@@ -320,8 +320,7 @@ def gauss_newton(
 
     def evaluate(at: Array) -> tuple[Array, Array]:
         residual, jacobian = (np.array(part) for part in mapped(at.T, *fixed))
-        rows = len(residual)
-        return residual.T, jacobian.reshape(rows, count, n).transpose(1, 0, 2)
+        return residual.T, jacobian.reshape(len(residual), count, n).transpose(1, 0, 2)
 
     residual, jacobian = evaluate(q)
     cost, damping = (residual**2).sum(axis=1), np.full(count, IK_SETTINGS.first_damping)

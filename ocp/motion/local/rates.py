@@ -200,8 +200,7 @@ class _Model:
         targets = equations.targets(self.time)
         jacobian, right = equations.jacobian(base, joints), equations.right(base, joints, targets)
         rates = least_rates(jacobian, right, damping, None if (weights == 1).all() else weights)
-        base_rate = machine.base_rate(base, joints, rates)
-        self.ode = ca.vertcat(base_rate, rates)
+        self.ode = ca.vertcat(machine.base_rate(base, joints, rates), rates)
         self.running = ca.dot(rates, ca.DM(weights) * rates) / 2
         if symbols is ca.SX:
             self.ode, self.running = ca.cse([self.ode, self.running])  # both contain the kinematics

@@ -117,8 +117,7 @@ def connect(search: TreeSearch, *, random: np.random.Generator, most_samples: in
             met = _grow_to(search, tree, new, other.nodes[targets], step)
             if met is not None:
                 place, index = met
-                ends = tree.branch(index)[::-1], other.branch(int(targets[place]))[1:]
-                path = np.vstack(ends)
+                path = np.vstack([tree.branch(index)[::-1], other.branch(int(targets[place]))[1:]])
                 return path if growing == 0 else path[::-1].copy()
         growing = int(len(trees[0].nodes) > len(trees[1].nodes))
     return None

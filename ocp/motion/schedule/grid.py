@@ -135,8 +135,7 @@ class Grid:
 
     def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
-        ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
-        return list(pairwise(ends))
+        return list(pairwise([*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]))
 
 
 class _Cells(NamedTuple):

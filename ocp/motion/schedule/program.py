@@ -465,8 +465,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         gap, size = constraints.evaluate(b)
     if accepted is not None:
         return accepted
-    row = int(violation.argmax())
-    place = float(spline.nodes[constraints.interval[row]])
+    place = float(spline.nodes[constraints.interval[int(violation.argmax())]])
     message = f"no motion keeps the limits near {place:g} m: they conflict by {worst:.2g}"
     raise SolveError(message, name="limits", value=worst, limit=INTERIOR.violation, time=place)
 

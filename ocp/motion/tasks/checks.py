@@ -114,8 +114,7 @@ def checked_tasks(
         words = f"rows {rows}: no joint moves the tip in rows {unmoved}; leave them out of the task"
         raise ProblemError(words, name="rows", value=unmoved)
     numeric = ca.Function("jacobian", [b, q], [jacobian])
-    rng = np.random.default_rng(0)
-    configurations = [joints, *rng.normal(size=(5, len(joints)))]
+    configurations = [joints, *np.random.default_rng(0).normal(size=(5, len(joints)))]
     if not any(_has_full_rank(np.array(numeric(base, at))) for at in configurations):
         words = f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they "
         words += "prescribe a motion twice or one that the machine cannot make; leave out rows"

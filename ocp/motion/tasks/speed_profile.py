@@ -113,10 +113,8 @@ class SpeedProfile:
         inside = ca.fmin(ca.fmax(time, 0.0), self.duration)
         table = np.stack([self.t[:-1], self.distance[:-1], self.speed[:-1], self.acceleration[:-1], self.jerk])
         segment = ca.low(ca.DM(self.t), inside, {"lookup_mode": "binary"}) if len(self.jerk) > 1 else ca.MX(0)
-        row = ca.MX(ca.DM(table))[:, segment]
-        start, s, v, a, j = ca.vertsplit(row)
-        t = inside - start
-        distance, speed, acceleration = integrate_jerk(v, a, j, t)
+        start, s, v, a, j = ca.vertsplit(ca.MX(ca.DM(table))[:, segment])
+        distance, speed, acceleration = integrate_jerk(v, a, j, inside - start)
         outputs = [s + distance, speed, acceleration, j]
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 

@@ -119,8 +119,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
     b, step, none = ca.SX.sym("b", target.base_size), times[1] - times[0], ca.DM(0, 1)
     rate = ca.Function("rate", [b], [target.base_rate(b, none, none)])
     after = ca.Function("after", [b], [rk4_step(lambda _, x: rate(x), b, step)])
-    moved = after.mapaccum(len(times) - 1)(base)
-    return np.vstack([base, np.array(moved).T])
+    return np.vstack([base, np.array(after.mapaccum(len(times) - 1)(base)).T])
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:

@@ -349,6 +349,5 @@ def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
         values = values + (configurations[1] - middle) * bump[:, None]
     times = share * seconds
     rates = np.gradient(values, times, axis=0)
-    second = np.gradient(rates, times, axis=0)
-    parts = {"joints": values, "velocities": rates, "accelerations": second}
+    parts = {"joints": values, "velocities": rates, "accelerations": np.gradient(rates, times, axis=0)}
     return {name: Samples(times, part) for name, part in parts.items()}
