@@ -130,9 +130,8 @@ class ConstantJerkMotion:
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
         """Return joint positions, rates and accelerations (K, M, n) at fractions (M,) of each phase's duration."""
         t = (self.durations[:, None] * places)[:, :, None]
-        joints, rates, accelerations, jerks = (
-            each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
-        )
+        values = self.joints, self.rates, self.accelerations, self.jerks
+        joints, rates, accelerations, jerks = (each[:, None] for each in values)
         return (
             joints + t * (rates + t * (accelerations / 2 + t * jerks / 6)),
             rates + t * (accelerations + t * jerks / 2),
@@ -292,9 +291,8 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
     parts = [torques.slow_down(_straight_motion(first, last - first, bounds)) for first, last in pairwise(corners)]
-    return ConstantJerkMotion(
-        *(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True))
-    )
+    fields = zip(*(vars(part).values() for part in parts), strict=True)
+    return ConstantJerkMotion(*(np.concatenate(values) for values in fields))
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:

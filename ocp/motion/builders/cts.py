@@ -181,14 +181,13 @@ def roll_problem(
     c, s = ca.cos(phi), ca.sin(phi)
     solution = configuration_at(rig, x, c, s, branch=settings.branch)
     joints = joints_of(rig, x, phi, solution)
-    limited_joints = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
-    limited = ca.vertcat(*[joints[k] for k in limited_joints])
+    bounded = [k for k in range(5) if np.isfinite([rig.lower[k], rig.upper[k]]).any()]
+    limited = ca.vertcat(*[joints[k] for k in bounded])
     reach = ca.vertcat(solution.sin4, solution.cos2)
     index = index_harmonics(rig, tunnel, x).value(c, s)
     proximity: Any = 0.0
-    violation = _violation(reach, -LARGEST_SINE, LARGEST_SINE) + _violation(
-        limited, rig.lower[limited_joints], rig.upper[limited_joints]
-    )
+    violation = _violation(reach, -LARGEST_SINE, LARGEST_SINE)
+    violation += _violation(limited, rig.lower[bounded], rig.upper[bounded])
     if obstacles is not None:
         distances = clearances(rig, joints, obstacles.scene, obstacles.radii)
         gap = soft_minimum(list(distances.values()), obstacles.softness)
@@ -232,11 +231,9 @@ def roll_problem(
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
-    if limited_joints:
-        unit = ", ".join(dict.fromkeys("rad" if k else "m" for k in limited_joints))  # the first joint slides
-        problem.path(
-            "limits", along("joints", limited), rig.lower[limited_joints], rig.upper[limited_joints], unit=unit
-        )
+    if bounded:
+        unit = ", ".join(dict.fromkeys("rad" if k else "m" for k in bounded))  # the first joint slides
+        problem.path("limits", along("joints", limited), rig.lower[bounded], rig.upper[bounded], unit=unit)
     if obstacles is not None and np.isfinite(obstacles.clearance):
         problem.path("clearance", along("gap", gap), obstacles.clearance, unit="m")
     running = along("index", index + proximity)

@@ -400,9 +400,7 @@ def _declare_motion(
     problem: Problem, machine: Motors, ends: _Ends, bounds: JointBounds, duration: float, control: str
 ) -> tuple[tuple[Any, Any, Any, Any], Any]:
     """Declare states and controls of base and joints; return base, positions, rates and accelerations, and jerks."""
-    guess = {
-        name: ends.quintic(duration, order) for order, name in enumerate(("joints", "velocities", "accelerations"))
-    }
+    guess = {name: ends.quintic(duration, k) for k, name in enumerate(("joints", "velocities", "accelerations"))}
     joints, rates, second, jerks = declare_joints(
         problem, machine.robot, bounds, guess, jerk=control == "jerk",
         starts=(ends.first, ends.first_rates, 0.0 * ends.first_rates),

@@ -281,9 +281,8 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
     for _ in range(SPLINE.projections):
         along = path.at(distance)
         step = np.nansum((position - along.position) * along.tangent, axis=1)
-        step /= np.maximum(
-            (np.where(np.isfinite(position), along.tangent, 0.0) ** 2).sum(axis=1), SPLINE.path_tolerance
-        )
+        squares = (np.where(np.isfinite(position), along.tangent, 0.0) ** 2).sum(axis=1)
+        step /= np.maximum(squares, SPLINE.path_tolerance)
         distance = np.clip(distance + step, 0.0, length)
     errors = gaps(path.at(distance).position, position)
     worst = int(errors.argmax())
@@ -405,7 +404,6 @@ def _torque_function(machine: FixedBase) -> _BatchedFunction:
         return inverse_dynamics(machine.robot, q, rate, acceleration, gravity=gravity, world_from_base=base)
 
     # gravity only in the third call makes the first two cheaper
-    values = ca.cse(
-        [ca.densify(each) for each in (torque(still, first), torque(first, second), torque(still, still, GRAVITY))]
-    )
+    terms = torque(still, first), torque(first, second), torque(still, still, GRAVITY)
+    values = ca.cse([ca.densify(each) for each in terms])
     return _BatchedFunction(ca.Function("torques", [q, first, second], values))

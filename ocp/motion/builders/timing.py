@@ -304,9 +304,8 @@ def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
-    error = np.maximum(
-        (demand - 1) / TIMING.demand, np.maximum(np.abs(distance_error), np.abs(speed_error)) / TIMING.defect
-    )[1:-1]
+    defect = np.maximum(np.abs(distance_error), np.abs(speed_error))
+    error = np.maximum((demand - 1) / TIMING.demand, defect / TIMING.defect)[1:-1]
     parts = np.ceil(np.sqrt(np.maximum(error, 1.0)) * 1.2).astype(np.intp)
     return np.where(error > 1, np.minimum(parts, TIMING.parts), 1)
 
@@ -394,9 +393,8 @@ def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | 
 
 def _bernstein(x: Array) -> Array:
     """Return the Bernstein polynomials of degree `TIMING.degree` at points x. Shape (len(x), degree + 1)."""
-    return np.stack(
-        [comb(TIMING.degree, i) * x**i * (1 - x) ** (TIMING.degree - i) for i in range(TIMING.degree + 1)], axis=1
-    )
+    n = TIMING.degree
+    return np.stack([comb(n, i) * x**i * (1 - x) ** (n - i) for i in range(n + 1)], axis=1)
 
 
 def distinct(values: Array, tolerance: float) -> Array:
@@ -414,15 +412,13 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
     path's derivatives jump. The whole time has at least the given number of intervals.
     """
     whole, (begin, end) = reference.duration, span
-    beside = TIMING.beside_jump * whole
+    beside, same = TIMING.beside_jump * whole, TIMING.same_node * whole
     joins = joins[(joins > begin + 2 * beside) & (joins < end - 2 * beside)]
     sides = np.concatenate([joins - beside, joins + beside])
-    changes = reference.t[
-        (reference.t > begin + TIMING.same_node * whole) & (reference.t < end - TIMING.same_node * whole)
-    ]
+    changes = reference.t[(reference.t > begin + same) & (reference.t < end - same)]
     if sides.size:
         changes = changes[np.abs(changes[:, None] - sides).min(axis=1) > 2 * beside]
-    nodes = distinct(np.concatenate([[begin, end], sides, changes]), TIMING.same_node * whole)
+    nodes = distinct(np.concatenate([[begin, end], sides, changes]), same)
     parts = np.maximum(np.ceil(np.diff(nodes) / (whole / intervals) - 1e-9), 1).astype(int)
     fractions = (subdivide(nodes, parts) - begin) / (end - begin)
     fractions[0], fractions[-1] = 0.0, 1.0

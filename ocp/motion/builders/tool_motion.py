@@ -434,9 +434,8 @@ def _declare_tasks(
         return
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.pose_rows).tolist()]
     # a velocity task has no pose: at the start of the motion its tip is where the reference has it
-    fixed = (
-        [] if stretch.begin else [equations.reference_error(base, joints, motion.setup.base, motion.setup.reference)]
-    )
+    reference = motion.setup.base, motion.setup.reference
+    fixed = [] if stretch.begin else [equations.reference_error(base, joints, *reference)]
     if (condition := ca.vertcat(error, *fixed)).numel():
         if motion.setup.relaxed:
             start_errors = problem.free_parameter(f"{START_ERRORS}{suffix}", condition.numel(), guess=0.0)

@@ -279,9 +279,8 @@ def slide_apart(
         if (clearance >= scene.clearance).any():
             break
         gradients = (distances(perturbed).reshape(count, n, -1) - gaps[:, None]) / SLIDING.difference
-        step = np.array(
-            [_separating_step(*each, target) for each in zip(map(jacobian, current), gaps, gradients, strict=True)]
-        )
+        closeness = zip(map(jacobian, current), gaps, gradients, strict=True)
+        step = np.array([_separating_step(*each, target) for each in closeness])
         current = back(np.clip(current + step, lower, upper))
     return best
 

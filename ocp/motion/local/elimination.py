@@ -350,9 +350,8 @@ def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
     other_angle = np.arctan2(signed[:, 2], signed[:, 1])
     multiples = angle[:, None] * [0.5, 1.5]
     waves = np.column_stack([np.cos(multiples), np.sin(multiples)])[:, [0, 2, 1, 3]]
-    products = (
-        waves[:, :, None] * np.column_stack([np.ones(len(rows)), np.cos(other_angle), np.sin(other_angle)])[:, None]
-    )
+    functions = np.column_stack([np.ones(len(rows)), np.cos(other_angle), np.sin(other_angle)])
+    products = waves[:, :, None] * functions[:, None]
     place = rows, row, column
     residual = real - products * (real[place] / products[place])[:, None, None]
     return angle, other_angle, np.abs(residual).max(axis=(1, 2), initial=0.0)

@@ -274,9 +274,8 @@ class _MultiStart:
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
         solutions = [IkSolution(*each) for each in zip(joints, quality.tolist(), errors[solved].tolist(), strict=True)]
-        return distinct_solutions(
-            sorted(solutions, key=lambda solution: -solution.quality), self._revolute, self.options.apart
-        )
+        solutions.sort(key=lambda solution: -solution.quality)
+        return distinct_solutions(solutions, self._revolute, self.options.apart)
 
     @property
     def _revolute(self) -> NDArray[np.bool_]:

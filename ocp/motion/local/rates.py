@@ -356,9 +356,8 @@ def track_tasks(
     motion = ca.Function("moves", [b, q, u], [machine.base_rate(b, q, u)]).map(count) if machine.base_size else None
     pose_rows, min_cosines = equations.pose_rows, np.cos(equations.cone_angles)
     functions = [equations.function, *([equations.cone_function] if min_cosines.size else [])]
-    symbols = [
-        symbols_of(*functions).sym("input", size) for size in (machine.base_size, machine.joint_size, len(targets))
-    ]
+    sizes = machine.base_size, machine.joint_size, len(targets)
+    symbols = [symbols_of(*functions).sym("input", size) for size in sizes]
     task = Sampler(symbols, [output for function in functions for output in function.call(symbols)])
     base_now, joints_now = np.array(base, dtype=float), np.clip(joints, lower, upper)
     bases, configurations, errors = [base_now], [joints_now], list[Array]()

@@ -60,9 +60,8 @@ class PlanSample(NamedTuple):
     tip: Array
 
     def __repr__(self) -> str:
-        return (
-            f"<PlanSample of {self.joints.shape[1]} joints at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
-        )
+        times = f"{len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s"
+        return f"<PlanSample of {self.joints.shape[1]} joints at {times}>"
 
 
 class Plan(ABC):

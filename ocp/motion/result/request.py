@@ -315,9 +315,8 @@ def restored_request(record: Any) -> MotionRequest:
         machine = _machine_of({first: own})
         if not isinstance(machine, MACHINES):
             raise TypeError(f"the machine is of type {type(machine).__name__}")
-        held = {
-            str(name): float(position) for name, position in _read(pool.get("held", {"pool": []}), [], None).items()
-        }
+        positions = _read(pool.get("held", {"pool": []}), [], None)
+        held = {str(name): float(position) for name, position in positions.items()}
         owner = hold_joints(machine, held) if held else machine
         others = {name: _read(value, functions, (machine, owner)) for name, value in pool.items() if name != first}
         arguments = {first: own, **others}

@@ -115,9 +115,7 @@ class ConsecutivePlans(Plan):
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
         """Target poses of the tasks of all consecutive plans, in world."""
-        return tuple(
-            target._replace(t=target.t + piece.begin) for piece in self.pieces for target in piece.plan.targets
-        )
+        return tuple(each._replace(t=each.t + piece.begin) for piece in self.pieces for each in piece.plan.targets)
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]

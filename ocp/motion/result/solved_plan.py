@@ -378,8 +378,6 @@ class PhasedPlan(SolvedPlan):
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
         for name, machine in zip(self.phases, self.machines, strict=True):
             states = self._solutions[name].states
-            sizes = [
-                values.shape[1] for values in (states.get(each, np.zeros((0, 0))) for each in ("joints", PHASED_RATES))
-            ]
+            sizes = [states.get(each, np.zeros((0, 0))).shape[1] for each in ("joints", PHASED_RATES)]
             if set(machine.robot.joint_names) != set(self.names) or sizes != [machine.joint_size] * 2:
                 raise ValueError(f"the solution has no joints and velocities of its machine in phase {name!r}")

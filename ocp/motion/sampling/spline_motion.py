@@ -272,9 +272,8 @@ class _Search:
             last = self.derivatives[-1]
             first, ahead = np.arange(order, order + last.shape[0] - 1), self.degree + 1 - order
             width = self.knots[first + ahead] - self.knots[first]
-            self.derivatives.append(
-                scipy.sparse.csr_array(scipy.sparse.diags_array(ahead / width) @ (last[1:] - last[:-1]))
-            )
+            derivative = scipy.sparse.diags_array(ahead / width) @ (last[1:] - last[:-1])
+            self.derivatives.append(scipy.sparse.csr_array(derivative))
         self.places = np.linspace(0.0, 1.0, 2 * settings.intervals + 2)[1:-1]
         both = self.degree == 2  # the acceleration jumps at knots
         sides = [self.breaks[:-1], (self.breaks[:-1] + self.breaks[1:]) / 2, self.breaks[1:]]
@@ -375,9 +374,7 @@ class _Search:
         matrix = scipy.sparse.vstack(rows).tocsc()
         by_duration = np.concatenate(by_time) + matrix @ (duration * self.moving).ravel()
         matrix = scipy.sparse.hstack([matrix[:, self.free], scipy.sparse.csc_array(by_duration[:, None])])
-        allowed = np.concatenate(
-            [np.full(len(usage), 1 + most) for usage, most in zip(usages, tolerances, strict=True)]
-        )
+        allowed = np.concatenate([np.full(len(part), 1 + most) for part, most in zip(usages, tolerances, strict=True)])
         squares = sum(float(((root @ points.ravel()) ** 2).sum()) / duration**power for power, root in self.residuals)
         cost = self.cost.time * duration + squares
         return _State(points, duration, cost, matrix.tocsr(), np.concatenate(usages), allowed)

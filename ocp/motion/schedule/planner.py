@@ -347,9 +347,8 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
     """Return in which intervals of the grid a speed profile violates a limit. Shape (N,)."""
     violated = np.zeros(len(grid.requested), dtype=bool)
     # inside an interval the jerk may change and the speed may have its maximum
-    peaks = profile.at(
-        np.concatenate([profile.t, np.maximum(profile.t[1:] - 1e-12 * profile.duration, 0.0), profile.peaks().t])
-    )
+    before = np.maximum(profile.t[1:] - 1e-12 * profile.duration, 0.0)
+    peaks = profile.at(np.concatenate([profile.t, before, profile.peaks().t]))
     at = segment_index(grid.distance, peaks.distance)
     for first, last in grid.blocks():
         at_nodes, inside = profile.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)

@@ -150,9 +150,8 @@ class TaskEquations:
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
         """Return the tip velocities in the components that the tasks prescribe, rad/s and m/s. Shape (size, 1)."""
-        return ca.densify(
-            ca.vertcat(*[part.rows(base, joints, part.twist(base, joints, rates)) for part in self.bound])
-        )
+        rows = [part.rows(base, joints, part.twist(base, joints, rates)) for part in self.bound]
+        return ca.densify(ca.vertcat(*rows))
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
         """Return by name the deviations of the tips from their tasks, each as arguments of `Problem.watch`.

@@ -281,9 +281,8 @@ class _Capture:
         if joints is None:
             raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
         target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
-        momentum = np.array(
-            ca.DM(pair_momentum(chaser, target, base=base, target_base=target_base, joints=joints))
-        ).ravel()
+        configurations = {"base": base, "target_base": target_base, "joints": joints}
+        momentum = np.array(ca.DM(pair_momentum(chaser, target, **configurations))).ravel()
         pair = replace(chaser, robot=robot, conserved_momentum=momentum)
         rates = end_velocities("start_velocity", begin.velocity, chaser.joint_size)
         times = (capture.approach, capture.detumble)

@@ -196,9 +196,8 @@ class _TipTracker:
 
 def _pose_gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
     """Return rotation vector and displacement, rad and m, from an actual to a desired tip pose in world. Shape (6,)."""
-    return np.concatenate(
-        [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
-    )
+    turned = scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T)
+    return np.concatenate([turned.as_rotvec(), place - position.ravel()])
 
 
 def _tip_path(

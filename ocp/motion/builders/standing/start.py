@@ -202,10 +202,8 @@ def local_guess(
         tasks = [retime_task(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]
     times, still = np.zeros(1), np.zeros((1, joints.size))
     parts = [joints[None, :], still, still]
+    options = AccelerationOptions(null_damping=STARTS.damping, stop_at_lift_off=False, speed_limit=STARTS.largest_speed)
     try:
-        options = AccelerationOptions(
-            null_damping=STARTS.damping, stop_at_lift_off=False, speed_limit=STARTS.largest_speed
-        )
         local = resolve_accelerations(
             machine, tasks, horizon, start=joints, external=external, step=horizon / STARTS.steps, options=options
         ).motion
