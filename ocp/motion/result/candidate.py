@@ -293,9 +293,8 @@ class MotionSample:
         errors = np.nan_to_num(equations.errors(self.t, self.base, self.joints), nan=np.inf)
         if not equations.pose_rows.all():
             targets = np.array(equations.target_function().map(len(self.t))(self.t[None, :]))
-            columns, right = (
-                np.array(part) for part in equations.function.map(len(self.t))(self.base.T, self.joints.T, targets)[:2]
-            )
+            values = equations.function.map(len(self.t))(self.base.T, self.joints.T, targets)
+            columns, right = (np.array(part) for part in values[:2])
             jacobians = columns.reshape(equations.size, *self.joints.shape)
             velocities = np.einsum("mkn,kn->km", jacobians, self.rates) - right.T
             strayed = np.cumsum(velocities[:-1] * np.diff(self.t)[:, None], axis=0)

@@ -191,9 +191,8 @@ class PathPlan(Plan):
         """Return the audit findings about the largest pose errors and the joint step that exceeds its limit most."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
-        turns = scipy.spatial.transform.Rotation.from_quat(
-            tips[:, [4, 5, 6, 3]]
-        ).inv() * scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
+        rotations = scipy.spatial.transform.Rotation.from_quat(tips[:, [4, 5, 6, 3]])
+        turns = rotations.inv() * scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
         steps = np.abs(np.diff(self.joints, axis=0)) - poses.step
         steps[list(self.reconfigurations)] = 0.0
         return [

@@ -207,10 +207,8 @@ class Dip:
     def __str__(self) -> str:
         slow = self.permitted < self.requested
         amount = f"permits {self.permitted:.4g} of {self.requested:.4g} m/s" if slow else "is active on a ramp"
-        return (
-            f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {amount}, "
-            f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
-        )
+        line = f"line acceleration {self.acceleration:.4g} m/s^2, jerk {self.jerk:.4g} m/s^3"
+        return f"{self.start:.6g} to {self.end:.6g} m: {self.cause} {amount}, {line}"
 
 
 @dataclass(frozen=True, eq=False)
