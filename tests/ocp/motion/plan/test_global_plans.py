@@ -149,13 +149,14 @@ def test_unsupported_searches_are_refused() -> None:
     task = moved(panda(), PANDA_START, "pose")
     loose = TipTask(position=[0.4, 0.0, 0.4], duration=1.0)
     turning = TipTask(velocity=[0.01, 0.0, 0.0], rows=[3, 4, 5], duration=1.0)
-    for machine, request, more, words in (
+    cases: list[tuple[FixedBase, TipTask, dict[str, Any], str]] = [
         (panda(), loose, {"search": "segments"}, "leave 4 degrees of freedom"),
-        (panda(), turning, {"start": PANDA_START}, "needs poses"),
-        (panda(), task, {"horizon": "free"}, "needs a fixed horizon"),
-    ):
+        (panda(), turning, {"start": PANDA_START, "search": "global"}, "needs poses"),
+        (panda(), task, {"horizon": "free", "search": "global"}, "needs a fixed horizon"),
+    ]
+    for machine, request, options, words in cases:
         with pytest.raises(ProblemError, match=words):
-            plan(machine, request, scene=False, **{"search": "global", **more})
+            plan(machine, request, scene=False, **options)
     with pytest.raises(Unreachable):
         plan(panda(), TipTask(position=[3.0, 0.0, 0.4], direction=[0, 0, -1], duration=1.0), search="global")
 
