@@ -396,7 +396,7 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Check solutions, and return them by name. A default name describes the method: ``Collocation legendre-3, 50``."""
+    """Return solutions by name, named after their methods (``Collocation legendre-3, 50``) if they have no names."""
     if isinstance(solutions, Mapping):
         require.each("certificate: solutions", solutions.values(), Solution)
         return require.mapping("certificate: solutions", solutions)

@@ -225,7 +225,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Raise ProblemError if dynamics, symbols at the start, signals or cost have a wrong size or type."""
+        """Raise ProblemError if dynamics, symbols of start values, signals or cost have a wrong size or type."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)

@@ -187,7 +187,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return R pairs of shapes to evaluate: the index of each one's pair of bodies in `pair`, its own in `rows`.
+        """Return index arrays (R,) of the pairs of shapes that represent pairs of bodies: into `pair` and into `rows`.
 
         The first of them are the K pairs of bodies in `pair`; then come the shapes that cover these bodies.
         """

@@ -406,7 +406,7 @@ class _Reader:
         return is_end
 
     def _end_path(self) -> None:
-        """Convert the moves collected since the last stop into cuts, and start a new path."""
+        """Convert the tool moves since the last stop into cuts (tool paths without a stop), and start a new path."""
         if not self.moves:
             return
         self.moved = True

@@ -132,7 +132,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the loop closure equation of the non-redundant joints, with intersecting or parallel axes last."""
+        """Return the closed loop of joint axes from base to tip and back, with intersecting or parallel axes last."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()

@@ -172,7 +172,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate colliding bodies or, if no bodies collide, refine the mesh to reduce the errors of the motion."""
+        """Solve again with separation constraints if bodies collide; otherwise refine the mesh of the motion."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)

@@ -118,7 +118,7 @@ class GoalRequest:
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
-        """Return a context manager that limits wall time, s, if the request has a time limit, else processor time."""
+        """Return a context manager that limits the seconds of wall time, or of processor time without a time limit."""
         return time_limited(seconds, processor=self.time_limit is None)
 
 

@@ -113,7 +113,7 @@ class MotionRequest:
 
     @property
     def cost(self) -> Any:
-        """Cost that the builder takes, or None for its default."""
+        """Cost function with which the problem is declared, or None for that of its builder."""
         return getattr(self.arguments.get("actuation"), "cost", self.arguments.get("cost"))
 
     def __repr__(self) -> str:

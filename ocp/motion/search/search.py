@@ -204,7 +204,7 @@ class AtlasSearch:
     # ---- paths of locally least cost ---------------------------------------------------------------------------------
 
     def class_representatives(self, max_cost: float, include_costlier: bool = False) -> list[Array]:
-        """Return the paths (K, n) of locally least cost, sorted by cost.
+        """Return a path (K, n) of locally least cost for each class of neighbouring paths, sorted by cost.
 
         Such a path leads through a chart through which motions cost less than through the neighbouring charts. After
         `solve`, only paths are returned that its bound does not exclude.

@@ -178,7 +178,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Divide the tasks into the fewest segments, at least cost; return their times and a lower bound of the number.
+        """Divide the tasks into the fewest segments that one motion each can do; return times and the least number.
 
         Args:
             barred: Begin and end, s, of intervals that are known to be infeasible in one segment.

@@ -185,7 +185,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return lower cost bounds on the charts of time sample `k`, from the bounds `after` at an adjacent sample.
+        """Return lower bounds on the cost from the charts of time sample `k`, given those of the `neighbour` sample.
 
         With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """

@@ -349,7 +349,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for joints that the tasks stop.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan where the tasks imply it.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
     joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task
