@@ -478,10 +478,8 @@ def end_of_reach(
     if limits and free.unreachable_at(within + (first - within) / REACH.intervals, limits=False) is None:
         cause, joint = _joint_at_limit(machine, nearest.joints)
         details |= joint
-    words = (
-        f"the reach ends, {cause}; at {first:.4g} s the nearest miss is {describe_miss(miss.distance, miss.angle)}; "
-        "ask for poses within reach or leave a row free"
-    )
+    words = f"the reach ends, {cause}; at {first:.4g} s the nearest miss is {describe_miss(miss.distance, miss.angle)}"
+    words += "; ask for poses within reach or leave a row free"
     details |= {"distance": miss.distance, "angle": miss.angle, "time": within}
     return Unreachable(words, nearest.joints, miss.pose_error, **details)
 

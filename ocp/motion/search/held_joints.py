@@ -155,10 +155,8 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
         columns = np.flatnonzero(scene.levers.joints[collision.pair]).tolist()
         names = [name for name in (robot.joint_names[column] for column in columns) if name in request.held]
         where = ", ".join(f"{name!r} stays at {request.held[name]:.4g}" for name in names)
-        words = (
-            f"{collision}, where {where}, since no task moves it; give a start with other positions, or ignore this "
-            f"pair of bodies: ignored={[scene.pair_names(collision.pair)]}"
-        )
+        words = f"{collision}, where {where}, since no task moves it; give a start with other positions, or ignore "
+        words += f"this pair of bodies: ignored={[scene.pair_names(collision.pair)]}"
         details: dict[str, Any] = {"value": collision.distance, "limit": scene.clearance}
         if pairs is with_obstacle:
             raise ProblemError(words, name=" and ".join(collision.bodies), **details)

@@ -118,13 +118,11 @@ class TaskSearch:
             free_directions = machine.joint_size - equations.size
             if free_directions > MAX_FREE_DIRECTIONS:
                 held = f" ({', '.join(request.held)} are held)" if request.held else ""
-                words = (
-                    f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined: "
-                    f"they prescribe {equations.size} rows, and {machine.joint_size} joints move: "
-                    f"{', '.join(machine.robot.joint_names)}{held}; search='segments' supports at most "
-                    f"{MAX_FREE_DIRECTIONS}. Lock a joint with lock_joints(robot, {{NAME: POSITION}}), add rows or a "
-                    "task, or use search='configurations'"
-                )
+                words = f"at t = {stretch.begin:g} s the tasks leave {free_directions} degrees of freedom undetermined:"
+                words += f" they prescribe {equations.size} rows, and {machine.joint_size} joints move: "
+                words += f"{', '.join(machine.robot.joint_names)}{held}; search='segments' supports at most "
+                words += f"{MAX_FREE_DIRECTIONS}. Lock a joint with lock_joints(robot, {{NAME: POSITION}}), add rows "
+                words += "or a task, or use search='configurations'"
                 details: dict[str, Any] = {"value": free_directions, "limit": MAX_FREE_DIRECTIONS}
                 raise ProblemError(words, name="search", **details, time=stretch.begin)
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
