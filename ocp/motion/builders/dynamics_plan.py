@@ -200,12 +200,14 @@ class SolveSettings:
     method: Collocation | None = None  # first mesh; None for that of the planner
     options: Mapping[str, Any] | None = None  # of IPOPT
     tolerances: Mapping[str, float] | None = None  # of the audit by name, see `ocp.audit.audit.audit`
-    cost: float = np.inf  # of the initial guess, see `barrier_options`; infinite if unknown
+    guess_cost: float = np.inf  # cost of the initial guess, see `barrier_options`; infinite if unknown
 
     def __post_init__(self) -> None:
         if self.method is not None:
             require.instance("method", self.method, Collocation)
         require.mapping("options", self.options)
+        if self.guess_cost != np.inf:
+            require.nonnegative("guess_cost", self.guess_cost)
 
     @property
     def ipopt_options(self) -> dict[str, Any]:
@@ -215,7 +217,7 @@ class SolveSettings:
     def options_from(self, problem: Problem, mesh: Collocation, guess: Guess) -> dict[str, Any]:
         """Return the IPOPT options for a guess; those that the user gives come before those that suit the guess."""
         suitable = WARM_START_OPTIONS if isinstance(guess, Solution) else {}
-        return {**barrier_options(problem, mesh, self.cost, suitable), **self.ipopt_options}
+        return {**barrier_options(problem, mesh, self.guess_cost, suitable), **self.ipopt_options}
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:

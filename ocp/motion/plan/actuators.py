@@ -205,7 +205,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     mesh = points.with_nodes_at(np.unique(np.concatenate([ramps, *fractions])).tolist())
     cost = unlimited.cost if request.cost is None else cost_of_motion(unlimited, request.cost)
     is_at_rest = cost <= request.settings.negligible_rate * request.stretches[-1].end
-    settings = SolveSettings(mesh, cost=np.inf if is_at_rest else cost)
+    settings = SolveSettings(mesh, guess_cost=np.inf if is_at_rest else cost)
     smoothing = Actuation.smoothing if is_at_rest else _smoothing(unlimited, mesh, cost, has_jerks)
 
     def solve_from(initial: Array) -> Solution:
