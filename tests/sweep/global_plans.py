@@ -34,7 +34,7 @@ KINDS = {"panda": (panda, 1), "ur5": (ur5, 1), "planar": (lambda: planar(np.arra
 """Machines and redundant degrees of freedom: a prescribed pose, a free roll, and a prescribed position in a plane."""
 RANDOM_KINDS = ("plain", "cut", "slow", "turning", "two")
 """Random planar arms: wide joint limits; narrow joint limits; low velocity limits; continuous joints; four joints."""
-COUNTS = {"panda": 60, "ur5": 30, "planar": 210, **dict.fromkeys(RANDOM_KINDS, 200)}
+COUNTS = {"panda": 100, "ur5": 50, "planar": 150, **dict.fromkeys(RANDOM_KINDS, 200)}
 """Number of tasks of each kind."""
 GAPS = {1: 0.02, 2: 0.1}
 RANDOM_GAPS = {False: 0.02, True: 0.08}

@@ -197,9 +197,8 @@ def _automatic(entry: Entry, unguessed: bool, send: Callable[[Row], None]) -> No
     """Send cost, mesh, seconds and feasibility of a solve without a method."""
     began = time.process_time()
     try:
-        problem = without_guess(entry.build()) if unguessed else entry.build()
         with time_limited(AUTOMATIC_SECONDS, processor=True):
-            plan = solve(problem)
+            plan = solve(without_guess(entry.build()) if unguessed else entry.build())
     except Exception as error:
         send({"automatic_failed": words(error), "automatic_seconds": time.process_time() - began})
         return
