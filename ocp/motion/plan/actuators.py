@@ -244,12 +244,10 @@ def _smoothing(unlimited: SolvedPlan, mesh: Collocation, cost: float, has_jerks:
         controls = _slopes(controls, times) if has_jerks else controls
         squares += float(np.trapezoid((controls**2).sum(axis=1), times.ravel()))
     order, default = 4 if has_jerks else 2, Actuation.smoothing
-    most = 2.0 * LIMIT_SHARE * cost
-    return (
-        default
-        if most >= squares * (default * unlimited.horizon) ** order
-        else ((most / squares) ** (1 / order) / unlimited.horizon)
-    )
+    largest = 2.0 * LIMIT_SHARE * cost
+    if squares * (default * unlimited.horizon) ** order <= largest:
+        return default
+    return float((largest / squares) ** (1 / order) / unlimited.horizon)
 
 
 def _guess_fractions(mesh: Collocation) -> Array:

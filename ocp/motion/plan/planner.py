@@ -84,29 +84,28 @@ def plan_from_configurations(
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
         return _final_plan(queue, solver), None
-    if request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS:
+    search, unsearched = None, request.search == "global" and request.redundancy > MAX_FREE_DIRECTIONS
+    if unsearched:
         require_poses(request)
-        queue.run(candidates_from(solver, motions), include_costlier=True)
-        if queue.passed:
-            return _final_plan(queue, solver), tool_rate_bound(request) or None
-    search = None
-    if request.search == "global" and request.redundancy <= MAX_FREE_DIRECTIONS:
+    elif request.search == "global":
         report("global search")
         search = TaskSearch(request, motions)
-    if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:
             return _final_plan(queue, solver), search.bound
     seeds = candidates_from(solver, motions)
-    queue.run(seeds)
+    queue.run(seeds, include_costlier=unsearched)
     if not queue.passed:
         _search_again(queue, solver, motions, configurations, seeds)
     try:
-        return _final_plan(queue, solver), None if search is None else search.bound
+        result = _final_plan(queue, solver)
     except SolveError as error:
         if search is not None and (dead_end := search.dead_end()) is not None:
             raise dead_end from error
         raise
+    if unsearched:
+        return result, tool_rate_bound(request) or None
+    return result, None if search is None else search.bound
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:

@@ -221,7 +221,7 @@ def _halve_intervals(
         inside = np.sqrt(np.minimum(top**2, (squares[:-1] + squares[1:]) / 2 + rates * width))
         # a wave may have equal phases at both ends and in the middle: other places tell
         places = np.concatenate([s[new] + share * width[new] for share in shares])
-        between, uneven = limit_rows(path, limits, joints, places), width[new] < 0
+        between, uneven = limit_rows(path, limits, joints, places), np.zeros(len(new), dtype=bool)
         for k, share in enumerate(shares):
             each = begin.take(new), between.take(slice(k * len(new), (k + 1) * len(new))), end.take(new)
             uneven |= _uneven_intervals(each, share, inside[new])

@@ -201,7 +201,8 @@ class _CellPass:
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
         # the angle of a wheel has no effect
-        self._effective = ~np.isin((robot := request.machine.robot).joint_names, list(find_wheels(robot)))
+        wheels = find_wheels(request.machine.robot)
+        self._effective = np.array([name not in wheels for name in request.machine.robot.joint_names])
         self._max_rate, self._cell_size = np.sqrt(2 * max_cost / request.horizon), settings.narrowest
         self._stretch_layers = list[int]()
         self.layers = list[_Layer]()

@@ -409,7 +409,9 @@ def tool_rate_bound(request: PlanRequest) -> float:
                 levers.append(tool.levers)
                 distances.append(tool.task_distances(task, times - task.begin))
         factor, right = np.vstack(levers) / np.sqrt(weights), np.hstack(distances)
-        for row, step in zip(right, np.diff(times), strict=True) if len(factor) else ():
+        if not len(factor):
+            continue
+        for row, step in zip(right, np.diff(times), strict=True):
             target = row / max(row.max(initial=0.0), TOLERANCE)
             dual = scipy.optimize.nnls(np.vstack([factor.T, target]), np.append(np.zeros(len(weights)), 1.0))[0]
             spread = float(((factor.T @ dual) ** 2).sum())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -318,9 +317,7 @@ def test_the_panda_moves_among_a_wall_a_box_and_a_table_in_the_least_time_of_its
     machine, folder = FixedBase(PANDA.read()), str(PANDA.path.parents[3])
     collisions = StraightMotions(CollisionScene(machine, [WALL, LOW_BOX, TABLE], folders=[folder]))
     assert not collisions.are_clear(PANDA_START[None], goal[None])[0]
-    begin = time.process_time()
     plan = panda_plan(Goal(joints=goal))
-    seconds = time.process_time() - begin
     assert plan.audit().feasible
     assert_the_panda_keeps_its_limits(plan)
 
@@ -330,7 +327,6 @@ def test_the_panda_moves_among_a_wall_a_box_and_a_table_in_the_least_time_of_its
     ruckig.Ruckig(1).calculate(alone, profile)
     assert profile.duration * (1 - 1e-6) <= plan.horizon <= 1.001 * profile.duration
     assert plan.bound == pytest.approx(profile.duration, rel=1e-6)
-    assert seconds < 5.0
 
 
 @pytest.mark.long

@@ -20,7 +20,7 @@ from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.shortening import PathPoses
-from ocp.motion.search.task_search import tool_motion_bound, tool_rate_bound
+from ocp.motion.search.task_search import _ToolLevers, tool_motion_bound, tool_rate_bound
 from tests.models.robot.trees import random_robot
 from tests.ocp.motion.plan.test_waypoints import poses
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, panda_arm
@@ -128,6 +128,32 @@ def test_no_motion_that_does_the_tasks_costs_less(seed: int, kind: str) -> None:
     least = tool_rate_bound(checked_request(machine, task, None, options))
     cost = float(weights @ swing**2) / 2 * (2 * np.pi / horizon) ** 2 * horizon / 2
     assert 0.0 <= least <= cost * (1 + 1e-9)
+
+
+def test_the_distances_of_a_task_are_those_of_its_path_and_of_its_turn() -> None:
+    """The tool moves along y and turns about z: an axis of the tool at the angle b from z turns by a smaller angle."""
+    levers, times = _ToolLevers.of(random_chain(1), Limits().bounds(random_chain(1))), np.linspace(0.0, 1.0, 6)
+    turn, lean = 0.4, 0.3
+    path: dict[str, Any] = {"position": lambda t: ca.vertcat(0.1, 0.5 * t, 0.2)}
+
+    def rotation(t: Any) -> Any:
+        c, s = ca.cos(2 * t), ca.sin(2 * t)
+        return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+
+    axis = ca.DM([np.sin(lean), 0.0, np.cos(lean)])
+    leaning = np.arccos(np.sin(lean) ** 2 * np.cos(turn) + np.cos(lean) ** 2)
+    for task, first, last in (
+        (TipTask(**path), 0.1, 0.0),
+        (TipTask(**path, rows=[4]), 0.1, 0.0),
+        (TipTask(**path, rows=[3, 5]), 0.0, 0.0),
+        (TipTask(**path, orientation=rotation), 0.1, turn),
+        (TipTask(orientation=rotation), 0.0, turn),
+        (TipTask(direction=lambda t: ca.mtimes(rotation(t), axis)), 0.0, leaning),
+        (TipTask(direction=lambda t: ca.mtimes(rotation(t), axis), within=0.1), 0.0, 0.0),
+    ):
+        distances = levers.task_distances(task, times)
+        assert distances[:, 0] == pytest.approx(first * np.ones(5), abs=1e-12)
+        assert distances[:, -1] == pytest.approx(last * np.ones(5), abs=1e-9)
 
 
 def test_tasks_relative_to_a_link_bound_nothing() -> None:
