@@ -56,9 +56,9 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return numbers, an array or a nested list as a float array; raise TypeError or a similar error for other values.
+    """Return numbers, an array or a nested list as a float array; raise one of `NOT_NUMBERS` for any other value.
 
-    Values that NumPy would convert are refused too: text, True, None, symbols (read as nan) and complex numbers.
+    Values that NumPy would convert are refused too: text, True, None, symbols (which become nan) and complex numbers.
     """
     check_entries(value)
     array = np.asarray(value)
@@ -102,9 +102,9 @@ def argument_of(label: str) -> str:
 class Checks:
     """Checks of function arguments: each method returns the checked value or raises an exception of a given class.
 
-    The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
-    "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
-    last word of the label, `value`, and `limit`, what is allowed.
+    The first argument of each check, `label`, is the name of the argument, preceded by its owner if this helps: "count"
+    or "box: size". Messages state the label, the requirement and the value. The exception has the fields `name`, the
+    last word of the label, `value`, and `limit`, the permitted values.
     """
 
     error: type[DetailedError]  # class of the exceptions
@@ -315,7 +315,7 @@ def _unit_text(unit: str) -> str:
 
 
 def _description(array: Array, wrong: Any) -> str:
-    """Return the text that an error message shows for an invalid array: all of it or its first invalid entry or row."""
+    """Return the text that an error message shows for an array: all entries, or the first invalid entry or row."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -328,14 +328,14 @@ def _description(array: Array, wrong: Any) -> str:
 def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
     """Warn with ModelWarning if an angle (rad) exceeds two turns; an angle above 1e4 means "no limit" and is accepted.
 
-    `label` is as in `Checks`; `name` is that of the warning, the last word of the label if None.
+    `label` is as in `Checks`; `name` is the attribute of the warning, by default the last word of the label.
     """
     words = "rad is more than two turns; angles are in rad, is it in degrees?"
     _warn_of_unit(label, angles, name, (4 * np.pi, 1e4), words)
 
 
 def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None) -> None:
-    """Warn if a length (m) exceeds 50 m and may be in millimetres; `warn_of_degrees` explains the arguments."""
+    """Warn if a length (m) exceeds 50 m, since it may be in millimetres; `warn_of_degrees` explains the arguments."""
     _warn_of_unit(label, lengths, name, (50.0, inf), "m is long for a robot; lengths are in m, is it in millimetres?")
 
 
@@ -350,7 +350,7 @@ def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tupl
 
 
 def similar_names(name: str, known: Iterable[str], most: int = 2) -> list[str]:
-    """Return the known names that shorten or extend a given name or, if there are none, names of similar spelling."""
+    """Return known names that abbreviate or extend a given name or, if there are none, names of similar spelling."""
     names = list(dict.fromkeys(known))
     related = [each for each in names if min(len(each), len(name)) > 2 and each[: len(name)] == name[: len(each)]]
     return related[:most] or get_close_matches(name, names, most, 0.5)

@@ -83,7 +83,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Decorate a function of CasADi matrices: for MX arguments, build a Function with SX symbols and call that.
+    """Decorate a function of CasADi matrices: for MX arguments, build a Function with SX symbols and call it.
 
     Element-wise MX graphs are slow to build and to run. Other arguments pass through unchanged. A flat list of scalars
     with MX entries counts as an MX column.
@@ -264,9 +264,9 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
 
 @on_scalars
 def determinant(matrix: Expression) -> Expression:
-    """Return the determinant, (1, 1), of a small square matrix (n <= 7), without divisions, which zero pivots forbid.
+    """Return the determinant, (1, 1), of a small square matrix (n <= 7), without divisions, since pivots may be zero.
 
-    Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
+    The Laplace expansion computes each minor of the first rows once: n 2^(n-1) products instead of n!.
     """
     matrix = expression(matrix)
     size = matrix.shape[0]
@@ -342,7 +342,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial of x without branches; beyond its breaks it continues if `beyond`, else is zero."""
+    """Evaluate a piecewise polynomial at x without branches; beyond its breaks, it continues if `beyond`, else is 0."""
     last = len(breaks) - 2
     total = ca.SX(ca.DM(coefficients[0, 0]))
     for k in range(last + 1):

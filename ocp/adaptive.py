@@ -184,7 +184,7 @@ class AdaptiveProblem:
         return plans
 
     def _failure(self, cause: SolveError, guess: Guess, ends: list[str]) -> SolveError:
-        """Return the SolveError for a problem without a plan on any first mesh, with the conflicting constraints."""
+        """Return the SolveError, with the conflicting constraints, for a problem that has no plan on any first mesh."""
         lines = [f"problem {self.problem.name!r} has no plan on any of the meshes tried", *str(cause).splitlines()]
         unknown = [name for name in self.formulation.states if name not in guessed_names(self.formulation, guess)]
         hint = f" states {', '.join(unknown)} have no guess" if unknown else ""

@@ -39,8 +39,8 @@ GRACE_PERIOD_S = 0.8
 class _Call(threading.Thread):
     """Thread that executes a call of a public function, and that the main thread can stop.
 
-    `stop` says that the call has been asked to end, `heard` that a loop in it has seen that, and `listeners` how many
-    loops poll it and end by themselves.
+    `stop` says that the call has been asked to end, `heard` that a loop in the call has noticed this request, and
+    `listeners` how many loops poll the request and end by themselves.
     """
 
     def __init__(self, work: Callable[[], Any]) -> None:
@@ -69,7 +69,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the public call in this thread: set ``stop`` and, if it does not end, raise KeyboardInterrupt in it."""
+        """Set ``stop`` to end the public call in this thread; if the call continues, raise KeyboardInterrupt there."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -243,7 +243,7 @@ _LISTENER: ContextVar[Callable[[str], Any] | None] = ContextVar("listener", defa
 def report(stage: str, *, step: bool = False) -> None:
     """Report the name of the current stage to the function that shows the progress of the call, and to the log.
 
-    One of many steps of a stage is not logged.
+    If `step` is set, the name belongs to one of many steps of a stage and is not logged.
     """
     if not step:
         LOG.info("%s", stage)

@@ -47,7 +47,7 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
 
     def within(self, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Evaluate the polynomial at relative positions 0..1 of intervals, which select one-sided limits at breaks.
+        """Evaluate the polynomial at relative positions 0..1 in given intervals, with one-sided limits at their ends.
 
         Shape (M, n) for ``interval`` and ``place`` of shape (M,).
         """

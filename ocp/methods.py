@@ -129,7 +129,7 @@ def solve(
     """Solve an optimal control problem by a given method, by default by collocation with mesh refinement.
 
     Without a method the cost is accurate to six digits (:class:`ocp.adaptive.AdaptiveCollocation`), and
-    ``Solution.refinement`` states whether the audit passes. With one:
+    ``Solution.refinement`` states whether the audit passes. A solve by a given method proceeds as follows.
 
     If the solver fails from the guess, it starts again from the guess displaced by seeded random amounts, from zeros
     (moved inside the bounds, a free horizon longer), from a roll-out of the dynamics with the controls of the guess,

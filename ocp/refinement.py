@@ -298,10 +298,10 @@ class _Row(NamedTuple):
     grows: bool = False
 
     def unresolved(self, widths: np.ndarray) -> float:
-        """Return the integral of the error over the intervals, of ``widths`` (N,), in which it exceeds its limit.
+        """Return the integral of the error over those intervals in which it exceeds its limit.
 
-        Splitting the intervals around a boundary layer or a jump lowers it from the first round on, the largest error
-        only once the intervals are narrow enough.
+        ``widths`` (N,) are the interval widths. Splitting the intervals around a boundary layer or a jump lowers the
+        integral from the first round on, but the largest error only once the intervals are narrow enough.
         """
         if self.errors is None:
             return self.value
@@ -321,7 +321,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Scale the contributions (N,) so that their maximum, or mean if they add up, is their error ``total``."""
+        """Scale the contributions (N,) so that their maximum, or mean if they add up, equals the error ``total``."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))

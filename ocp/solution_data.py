@@ -138,7 +138,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack the arrays (M, n) of a dictionary side by side; without arrays return ``like`` rows and no columns."""
+    """Stack the arrays (M, n) of a dictionary side by side; if it is empty, return an array of shape (``like``, 0)."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
@@ -291,7 +291,7 @@ def register(operation: str, module: str) -> None:
 
 
 def call_registered(operation: str, *args: Any, **options: Any) -> Any:
-    """Call a function that `register` has made available; raise LookupError if there is none."""
+    """Call a function that `register` has made available; raise LookupError for an unknown name."""
     if operation not in _FUNCTIONS:
         raise LookupError(f"no package has registered {operation!r}; import ocp, which registers all of them")
     function: Callable[..., Any] = getattr(importlib.import_module(_FUNCTIONS[operation]), operation)

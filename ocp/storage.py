@@ -32,7 +32,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"  # precedes it in a larger archive
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays to a compressed ``.npz`` file atomically, if :func:`read_arrays` accepts their size."""
+    """Write named arrays to a compressed ``.npz`` file atomically; raise ProblemError if they are too large."""
     checked_path(path)
     size = sum(array.nbytes for array in arrays.values())
     if size > MAX_FILE_BYTES:

@@ -70,7 +70,7 @@ class Incumbent(NamedTuple):
 
 
 class RoughRoll(NamedTuple):
-    """Approximation of a roll angle of the rig that may be optimal, with a lower bound of the cost near it.
+    """Approximation of a roll angle of the rig that may be optimal, with a lower bound of the cost near this angle.
 
     Attributes:
         bound: Lower bound of the cost near the point; inf if the roll is infeasible.
@@ -89,14 +89,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost of a roll angle, inf if the pitch link or joints 4 to 6 exclude the angle, and cosine of joint angle 2."""
+    """Cost and cosine of joint angle 2 at a roll angle; the cost is inf if pitch link or joints 4 to 6 exclude it."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2 (q2: angle of joint 2) at which a constraint is active, and a lower bound of the cost near it.
+    """A value of cos q2 (q2: joint angle 2) at which a constraint is active, and a lower bound of the cost near it.
 
     `side` is as in RoughRoll.
     """
@@ -361,7 +361,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of the changes of sin q4, cos q2 (joint angles q) if the roll changes by the root tolerance."""
+        """Return how much sin q4 and cos q2 (q: joint angles) can change if the roll changes by `root_tolerance`."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
@@ -416,9 +416,9 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare given roll angles with the best one so far, `best`; return the best of all and the given ones' costs.
+        """Compare given rolls with the best roll so far, `best`; return the new best roll and the given rolls' costs.
 
-        The result is (Incumbent, list of Evaluation, cost): evaluations and least cost are those of the given rolls.
+        The result is (Incumbent, list of Evaluation, least cost) with evaluations and least cost of the given rolls.
         """
         f = self._index(target)
         cost, c, s, code, below, above = best
@@ -461,7 +461,7 @@ class Search:
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return joint positions, cost, active constraint and status at the best roll so far as a column, (9, 1)."""
+        """Return the column, (9, 1), of joint positions, cost, active constraint and status at the best roll so far."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)

@@ -45,14 +45,14 @@ def _distance_to_walls(capsule: LinkCapsule, walls: Box) -> Expression:
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for the roll angle of least cost at which the rig collides with nothing.
+    """Settings of the search for the roll angle of least cost at which the rig is free of collisions.
 
     Attributes:
         samples: Number of rolls in the grid.
         softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
         minima: Number of local minima on the grid that are refined.
-        steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes: 0.62^44 = 7e-10
-            of the grid's.
+        steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes; the last step is
+            0.62^44 = 7e-10 of the grid's step.
         penalty: Penalty on missing clearance in the merit function, 1/m.
         inset: Distance beyond the least clearance that the search aims for, m.
         active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
@@ -148,7 +148,7 @@ def clearances(
 
 
 def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return the cost weight exp(-gap / width), which grows as the gap (m) between rig and obstacles closes.
+    """Return the cost `weight` * exp(-`gap` / `width`), which grows as the gap (m) between rig and obstacles closes.
 
     Raises:
         ModelError: The weight is negative or not finite, or the width is not positive.
@@ -259,9 +259,9 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return the symbolic inputs and outputs of a Function that selects the lowest local minima on a grid of rolls.
+    """Return symbolic inputs and outputs of a Function that selects the lowest local minima of a merit on a roll grid.
 
-    (merits) -> columns (angle, merit, step), one for each minimum.
+    (merits) -> columns (angle, merit, step of the grid), one for each minimum.
     """
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
@@ -282,7 +282,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
     """Return symbolic inputs and outputs of a Function that selects, of several roll angles, the angle of least cost.
 
-    (angles, values) -> (best angle, least value, whether it is the first).
+    (angles, values) -> (best angle, least value, whether the first angle is the best).
     """
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
     best, least, is_first = angles[0], values[0], ca.SX(1)

@@ -91,7 +91,7 @@ class Tunnel:
     """Wind tunnel data for the cost, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
 
     Attributes:
-        center: P_C of equation (35) in world. Shape (3,), m.
+        center: P_C of equation (35) in the world. Shape (3,), m.
         ranges: P_M - P_m, the useful extent along x, y, z. Shape (3,), m.
         weights: w1, w2, w3. Shape (3,).
 
@@ -136,12 +136,12 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Joint positions q1, q2, q4 and the point of the goose-neck's corner for a target, a roll angle and a branch.
+    """Joint positions q1, q2, q4 and position of the goose-neck's corner for a target, a roll angle and a branch.
 
     Attributes:
-        corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.
-        sin4, cos4, sin2, cos2: Sines and cosines of joints 4 and 2. Out of reach sin4 or cos2 leaves [-1, 1] and its
-            partner is nearly 0.
+        corner: Position P_G of the goose-neck's corner in the world. Shape (3, 1), m.
+        sin4, cos4, sin2, cos2: Sines and cosines of joint angles 4 and 2. If the target is out of reach, sin4 or cos2
+            is outside [-1, 1], and cos4 or sin2, respectively, is nearly 0.
         q1: Position of the prismatic joint, m.
     """
 
@@ -181,7 +181,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the pose (x, y, z, yaw, pitch, roll) of the tool at joint positions q, in world. Shape (6, 1), m and rad.
+    """Return the pose (x, y, z, yaw, pitch, roll) of the tool in the world at joint positions q. Shape (6, 1), m, rad.
 
     Equations (16) to (22) of the paper. Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
@@ -269,7 +269,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
 
 
 def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: RigConfiguration) -> Expression:
-    """Return the joint positions, (6, 1), of a rig configuration, each angle shifted by full turns near mid-range."""
+    """Return the joint positions, (6, 1), of a rig configuration; full turns bring each angle close to mid-range."""
     q2 = ca.atan2(configuration.sin2, configuration.cos2)
     q4 = ca.atan2(configuration.sin4, configuration.cos4)
     angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]

@@ -179,7 +179,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return those possible ends of the rig's feasible roll intervals that have a closed form.
+    """Return the possible ends of the rig's feasible roll intervals that have a closed form.
 
     They are due to the limits of joints 4 to 6 and to the reach of the pitch link.
     """
@@ -207,7 +207,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append to `levels` a value of cos q2 where intervals may end; irrelevant if joint 3 is then beyond limits."""
+        """Append to `levels` a value of cos q2 at which intervals may end, if joint 3 is then within its limits."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -253,7 +253,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 (joint angle 4) at which feasible roll intervals may end, and codes of the limits."""
+    """Return values of sin q4 (joint angle 4) at which feasible roll intervals may end, each with its limit's code."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -274,7 +274,7 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits, up to a tolerance of cosines."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits, up to `slack` in the cosine."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -290,9 +290,9 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return the CasADi Function from target and roll angle to cos q2 and q1 (q: joint positions), whose limits bound
-    the feasible roll angles, and to cos q4, on which the rounding error of cos q2 depends.
+    """Return the CasADi Function from target and roll angle to cos q2, q1 and cos q4, where q are the joint positions.
 
+    The limits of cos q2 and q1 bound the feasible rolls. The rounding error of cos q2 depends on cos q4. Signature:
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll angle. Other functions take the Function as their argument `chart`.
     """
@@ -304,10 +304,10 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2 (angle of joint 2) equals a limit, on the feasible side despite rounding.
+    """Return the roll angle at which cos q2 (angle of joint 2) is within a limit by a margin for rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
-    is satisfied above the value, -1 if below.
+    is satisfied above `value`, -1 if below.
     """
     c, s = polish(point, chart_residual(chart, target, 0, value))
     cos4 = ca.fabs(chart(target, c, s)[4])
@@ -350,7 +350,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return a CasADi Function for the roll angles (8 cosines and sines) at which the prismatic joint is at a limit."""
+    """Return a CasADi Function for eight roll angles (cosine, sine) at which the prismatic joint may be at a limit."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)

@@ -221,7 +221,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the parameter in [-1, 1] at which a combination of the conics that `roots` intersects is two real lines.
+    """Return the parameter in [-1, 1] of the two real lines in the pencil of the conics that `roots` intersects.
 
     The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """

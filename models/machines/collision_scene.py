@@ -143,7 +143,7 @@ class CollisionScene:
     def with_locked(self, machine: Machine) -> CollisionScene:
         """Return the scene of the machine with some joints locked, without pairs whose distance is then constant.
 
-        A scene of its own would take links as adjacent that only the locked joints connect.
+        A newly built scene would treat links that only locked joints connect as adjacent.
         """
         return replace(self, machine=machine)
 
@@ -214,7 +214,7 @@ class CollisionScene:
         set_fields(self, pairs=np.array(pairs, dtype=int).reshape(-1, 3))
 
     def _reference_link(self, first: Body, second: Body) -> str:
-        """Return the link farthest from the root of the kinematic tree that carries both given bodies."""
+        """Return the common ancestor link of two bodies that is farthest from the root of the kinematic tree."""
         return self._parts.common_part(*(self._parts.of_link[body.link] for body in (first, second)))
 
     @property
@@ -234,7 +234,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reasons why pairs of links that seem to collide permanently are not checked, by "A and B" (link names)."""
+        """Reasons why pairs of links that seem to collide permanently are not checked, keyed by text "A and B"."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -317,7 +317,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds of the pairs' relative velocity per unit joint rate; ModelError for an unlimited prismatic joint."""
+        """Bounds of each pair's relative velocity per unit coordinate rate; raises ModelError if one is infinite."""
         n, dof, size = len(self.pairs), self.machine.robot.dof, self.machine.base_size
         joints, turns = np.zeros((n, dof)), np.zeros((n, dof))
         base, base_turns = np.zeros((n, size)), np.zeros((n, size))
@@ -350,10 +350,10 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return pairs of bodies checked by convex hulls of meshes, not by covering shapes, grouped by pair of meshes.
+        """Return the pairs of bodies whose checks use hulls of meshes instead of covers, grouped by pair of meshes.
 
-        They have at most three joints between them and may be closer by design than the covers of their meshes allow,
-        or their covers always collide.
+        Such bodies have at most three joints between them and may be closer by design than the covers of their meshes
+        allow, or their covers always collide.
         """
         pairs: dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]] = {}
         for i, j in checked:
@@ -369,7 +369,7 @@ class CollisionScene:
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return bounds of a body's velocity per unit rate of joints and base, relative to a link or the world (-1)."""
+        """Return bounds of a body's velocity relative to a link or the world (-1), per unit rate of joints and base."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         levers = Levers(np.zeros(size), np.zeros(size), np.zeros(robot.dof), np.zeros(robot.dof))
         if not 0 <= placed.frame < len(self._carriers):

@@ -226,7 +226,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum at given rates minus the conserved momentum, which is zero for every possible motion."""
+        """Return the momentum at given rates minus the conserved momentum: zero for every possible motion."""
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
         if carried is None:

@@ -56,7 +56,7 @@ class Machine(Protocol):
         """Number of independently moving joints."""
 
     def base_home(self) -> Array:
-        """Return the base configuration at the world's origin, empty for a fixed base. Shape (base_size,)."""
+        """Return the base configuration with root and world frame equal, empty for a fixed base. Shape (base_size,)."""
 
     def world_from_base(self, base: Expression) -> Frame:
         """Return the pose of the root link's frame in the world."""
@@ -65,7 +65,7 @@ class Machine(Protocol):
         """Return the pose of the tip frame in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the matrix, (6, joint_size), from joint rates to the tip's twist, including base motion they cause."""
+        """Return the matrix, (6, joint_size), from joint rates to the tip's twist, which includes the base motion."""
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Return the tip's twist (6, 1): tip_jacobian times joint_rates plus the drift due to conserved momentum."""

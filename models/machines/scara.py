@@ -96,7 +96,7 @@ class Scara:
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Return the pose of the tool in the world for joint positions, shape (4,), as CasADi matrix or numbers."""
+        """Return the pose of the tool in the world for joint positions, numbers or a CasADi matrix of shape (4,)."""
         q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -135,7 +135,7 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi (0 for the quill) that shifts positions `least` to `most` into a joint's limits.
+        """Return the multiple of 2 pi (0 for the quill) that shifts the range `least` to `most` into a joint's limits.
 
         Return None if no multiple does; the tolerance is 1e-9 rad or m.
         """

@@ -198,7 +198,7 @@ class Stance(FixedBase):
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the contact wrenches (loads) of all standing feet in a motion, given those of all but the first."""
+        """Return the loads (contact wrenches) of all standing feet in a motion, given all loads but the first."""
         reaction = base_reaction(self.bodies, q, qd, qdd, **self._forces(others))
         first = next(iter(self.footholds))
         moment, force = reaction[:3], reaction[3:]
@@ -228,10 +228,10 @@ class Stance(FixedBase):
     def load_rows(self) -> dict[str, tuple[int, ...]]:
         """Indices of the load components, for each foot but the first, along which the joints can move the foot.
 
-        In world axes, they are all six, or three in a plane. The other components of the load are taken as zero.
+        In world axes, these are all six, or three for a planar robot. The other components of a load are taken as zero.
 
         Raises:
-            ModelError: These rows are always dependent, because the robot's plane is oblique to the axes.
+            ModelError: These rows of the Jacobian are always dependent, as the robot's plane is oblique to the axes.
         """
         rng = np.random.default_rng(0)
         rows_of_feet = {}
@@ -256,7 +256,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return all six components, (6, 1), of a foot's load from those in `load_rows`; the other ones are zero."""
+        """Return all six components, (6, 1), of a foot's load from the components `load_rows`; the others are zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:

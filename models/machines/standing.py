@@ -57,7 +57,7 @@ class ZmpRows(NamedTuple):
     right: Expression  # C, with gravity and the wrenches. Shape (2, 1).
 
     def needed(self, qd: Expression) -> Expression:
-        """Return the moments that joint accelerations must produce to keep the zero moment point. Shape (2, 1), N m."""
+        """Return the moments that joint accelerations must produce to hold the zero moment point. Shape (2, 1), N m."""
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 

@@ -239,7 +239,7 @@ def convex_hull(points: ArrayInput) -> Array:
 
 
 def _corners(shape: CollisionShape) -> Array:
-    """Return the points of a collision shape, in world, that may touch the ground. Shape (k, 3), m."""
+    """Return the points of a collision shape, in the world, that may touch the ground. Shape (k, 3), m."""
     down = -np.asarray(shape.rotation)[2]  # in the shape's axes
     if shape.kind == "box":
         corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * shape.size / 2

@@ -47,7 +47,7 @@ The distance at u = 1/2 is |1 - c shape| cos(angle/2) times the remaining distan
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return shape factors of blends (end derivative over distance from the corner) after checks. Shape (count,).
+    """Return checked shape factors of blends (end derivative over distance from the corner). Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -118,7 +118,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the distance of a blend's middle from the corner between two lines, relative to that of the blend's ends.
+    """Return the distance from the corner of two lines to a blend's middle, divided by the distance to its ends.
 
     Equation (8): |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, the distance
     at u = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -420,10 +420,10 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the CasADi Function that advances the parameter u of a blend by arc lengths: quadrature and Newton steps.
+    """Return the CasADi Function that advances a blend's parameter u by arc lengths, with quadrature and Newton steps.
 
-    The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
-    `predictor_corrector`; `nodes` is the number of quadrature nodes for each Newton step, the last of which determines
+    The predictor is equation (15); the Newton steps solve for the arc length. Arguments and result are as for
+    `predictor_corrector`. `nodes` has the number of quadrature nodes for each Newton step; the last number determines
     the drift.
     """
     nodes = require.each("mapping: nodes", nodes, int)
@@ -441,7 +441,7 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
 
 
 def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
-    """Return the curve parameters u, (M,), of a blend at increasing distances (M,), m, from its start, one by one.
+    """Compute, one by one, the curve parameters u, (M,), of a blend at increasing distances (M,), m, from its start.
 
     `mapping` is a result of `predictor_corrector` or `gauss_newton`, `coefficients` are those of the blend, (6, 3).
 
@@ -465,7 +465,7 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
-    """Return symbolic inputs (state, coefficients, steps) of a Function for `march`, and a curve's speed |dr/du|."""
+    """Return symbolic inputs (state, coefficients, steps) of a Function for `march`, and the function u -> |dr/du|."""
     degree = require.choice("blend: degree", degree, (3, 5))
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())

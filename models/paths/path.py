@@ -48,7 +48,7 @@ NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A chain of lines, arcs, helices and splines, each starting at the end of the one before.
+    """A chain of segments (lines, arcs, helices and splines), each of which starts where the previous segment ends.
 
     Attributes:
         segments: The segments in order, at least one.
@@ -147,7 +147,7 @@ class Path:
         return results
 
     def turn_at(self, index: NDArray[np.intp], distance: Array) -> tuple[Array, Array, Array]:
-        """Return tool orientations and their first two derivatives, in world, at distances (m) along given segments.
+        """Return tool orientations in the world, and two derivatives of them, at distances (m) along given segments.
 
         Shapes: index and distance (M,), results (M, 4), (M, 3), (M, 3), 1, rad/m and rad/m^2.
         """
@@ -357,7 +357,7 @@ def fit_splines(
 
 
 def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
-    """Return a polyline within a distance `sagitta` (m) of a path's arcs, and its point index at each path vertex."""
+    """Return a polyline within `sagitta` (m) of a path's arcs, and the index of the polyline's point at each vertex."""
     with np.errstate(divide="ignore"):
         chord = np.where(path.is_spline, np.inf, np.sqrt(8 * sagitta / path.curvature))
     counts = np.maximum(np.ceil(path.lengths / chord), 1).astype(int)
@@ -402,7 +402,7 @@ def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: fl
 def _replace_run(
     segments: Sequence[Segment], line: Polyline, tolerance: float, angle: float
 ) -> tuple[Segment, float] | None:
-    """Return one segment in place of a run of segments and a bound of its deviation (m), or None if no segment fits."""
+    """Return one segment that replaces a run of segments, and a bound of its deviation (m); None if no segment fits."""
     (points, quaternions), deviation = line, float(distances_from_chord(line.points).max())
     is_line = deviation <= min(RUNS.simplified * tolerance, float(np.linalg.norm(points[-1] - points[0])))
     is_line &= quaternions is None or bool((np.diff(quaternions, axis=0) == 0).all())

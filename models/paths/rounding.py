@@ -60,7 +60,7 @@ class _Corners(NamedTuple):
     vertices: NDArray[np.intp]  # indices of the vertices; 0 is the end of the first segment. Shape (V,).
 
     def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
-        """Return the corners with the given indices among these corners."""
+        """Return only the corners with the given indices."""
         return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
 
     @property
@@ -269,7 +269,7 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances, (V, S), m, of points (V, S, 3) from V segment parts from `first` to `last` (m)."""
+    """Return distances (V, S), m, of points (V, S, 3) from V segments between the distances `first` and `last` (m)."""
     spatial = (path.torsion[index] != 0) | path.is_spline[index]
     if spatial.any():
         result = np.empty(points.shape[:2])

@@ -255,7 +255,7 @@ def screw(
     torsion: float | Array,
     distance: float | Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the point at a distance along a line, arc or helix, and its first three derivatives by the distance.
+    """Return the point at a distance along a line, arc or helix, and three derivatives with respect to the distance.
 
     Args:
         start, tangent, normal: Point, unit tangent and unit normal at distance 0. Shape (..., 3), m and unit vectors.
@@ -279,9 +279,9 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return axial and tangential part of a helix's tangent, vector to the axis, (..., 3) each, and turn rate, rad/m.
+    """Return axial and tangential part of a helix's tangent, the vector to its axis (..., 3), and turn rate (rad/m).
 
-    Arguments as for `screw`.
+    The arguments are those of `screw`.
     """
     k, w = np.asarray(curvature, dtype=float), np.asarray(torsion, dtype=float)
     if not np.any(w):

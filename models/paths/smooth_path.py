@@ -185,7 +185,7 @@ class SmoothPath:
         return _in_blocks(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
-        """Return tool orientation, and its derivatives by distance, at distances from the path's start, shape (M,), m.
+        """Return tool orientations, and derivatives of them by arc length, at distances (M,), m, from the path's start.
 
         Orientation, rate and acceleration are continuous.
         """
@@ -297,10 +297,9 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Tool orientation on each segment and blend: reference quaternions, (P, 4), and rotation vectors from them,
-        (P, 6, 3).
+        """Tool orientation on segments and blends: reference quaternions, (P, 4), and rotation vectors from these.
 
-        The latter are polynomials of distance / length.
+        The rotation vectors are polynomials of distance / length with coefficients (P, 6, 3).
         """
         path, lengths = self.path, self.piece_lengths
         start_offset = np.concatenate([[0.0], self.remaining])
@@ -428,11 +427,11 @@ def _cell_function() -> Any:
 
 
 def _part_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the distances at which the parts of a path start, then its length, and a column of each part's geometry.
+    """Return the distances at which the parts of a path start, followed by its length, and the geometry of each part.
 
-    A part is what remains of a line, arc or helix, or a cell of a curve. A segment has its start point, the axial,
-    tangential and inward vectors of its screw, and its rotation rate; a curve its coefficients. Both have distance,
-    length, whether it is a curve, u at the start, width in u, speeds at both ends.
+    A part is the remainder of a line, arc or helix, or a cell of a curve; its geometry is a column. A segment has its
+    start point, the axial, tangential and inward vectors of its screw, and its rotation rate; a curve has coefficients.
+    Both also have distance, length, whether the part is a curve, u at the start, width in u, speeds at both ends.
     """
     on_segment = np.flatnonzero(path.piece_curve < 0)
     count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells

@@ -134,7 +134,7 @@ class Spline:
         return Spline(curves, np.asarray(self.references)[pieces], _between(np.asarray(self.turns)[pieces], *limits))
 
     def turn_at(self, distance: float) -> tuple[Array, Array, Array]:
-        """Return the tool orientation and its first two derivatives, in world, at a distance (m) from the start."""
+        """Return the tool orientation in the world, and its first two derivatives, at a distance (m) from the start."""
         assert self.references is not None
         assert self.turns is not None
         piece = int(np.clip(np.searchsorted(self.bounds, distance, side="right") - 1, 0, len(self.bounds) - 2))
@@ -171,7 +171,7 @@ class SplineTable(NamedTuple):
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
-        """Return the table that locates distances on a path's splines, from its segments and where these begin (m)."""
+        """Return the table that locates distances on a path's splines, given all segments and where they start (m)."""
         splines = [(each, begin) for each, begin in zip(segments, begins, strict=True) if isinstance(each, Spline)]
         counts = [len(each.cells.curve) if isinstance(each, Spline) else 0 for each in segments]
         curves = np.concatenate([np.asarray(each.coefficients)[each.cells.curve] for each, _ in splines])

@@ -242,7 +242,7 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return, by link, its origin's acceleration minus gravity and the matrix [alpha x] + [omega x]^2, in link axes."""
+    """Return, by link name, the origin's acceleration minus gravity and [alpha x] + [omega x]^2, in link axes."""
     rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -315,7 +315,7 @@ def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | No
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the spatial inertia of the robot with locked joints about the world's origin. World axes, shape (6, 6)."""
+    """Return the robot's spatial inertia with locked joints, about the world's origin in world axes. Shape (6, 6)."""
     return ca.densify(subtree_moments(robot, link_frames(robot, q, world_from_base))[robot.root].spatial_inertia())
 
 

@@ -78,9 +78,9 @@ def checked_placement(placement: Placement | None, label: str = "world_from_base
 
 
 def expand_joint_vector(robot: Robot, vector: Expression, label: str = "q") -> dict[str, Expression]:
-    """Return a joint vector's entries for all moving joints by name; entries of mimic joints include their multipliers.
+    """Return a joint vector's entries for all moving joints, by name; a mimic joint's entry includes its multiplier.
 
-    Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
+    The result is right for rates and accelerations; for positions, the offsets of mimic joints are missing.
     """
     vector = joint_vector(robot, vector, label)
     return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}

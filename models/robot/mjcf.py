@@ -262,9 +262,9 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
 
 
 def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any, str]]:
-    """Replace meshes and height fields by spheres, except on bodies that `is_kept` accepts; return them and mesh names.
+    """Replace meshes and height fields by spheres, except on `is_kept` bodies; return replaced geoms and mesh names.
 
-    The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh "".
+    The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh name "".
     """
     replaced = []
     for geom in (each for each in spec.geoms if (each.meshname or each.hfieldname) and not is_kept(each.parent)):

@@ -128,7 +128,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Return one robot that joins several, such as arms, on a common base; its tip is the tip of the first one.
+    """Return one robot that joins several, such as arms, on a common base; its tip is the tip of the first robot.
 
     Args:
         base: A link or a robot that carries the arms.

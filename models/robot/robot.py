@@ -110,11 +110,11 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF text or file; `models.robot.urdf.read_urdf` states what is read and the defaults.
+        """Read a robot from a URDF text or file; see `models.robot.urdf.read_urdf` for its contents and defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
-            tip: Link that carries the tip. If None, the one that the file names as to_urdf does, else the only leaf.
+            tip: Link that carries the tip. If None, the link that `to_urdf` stored in the file, else the only leaf.
             root: Link to become the root of the tree, the base; the root of the file if None. Links keep their frames,
                 joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
             tip_translation: As in Robot.

@@ -42,7 +42,7 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Convex hull of the mesh in link axes; coplanar points are first thickened to cubes of half-edge 1 um."""
+        """Convex hull of the mesh in link axes; cubes of half-edge 1 um first replace points that are coplanar."""
         try:
             return Mesh.around(cached_hull(self.points))
         except ModelError:
@@ -156,10 +156,10 @@ def _primitive_body(link: Link, shape: CollisionShape) -> Body:
 
 
 def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
-    """Return volume (m^3), size (radius, length without caps, m) and protrusion (m) of a cylinder's smallest capsule.
+    """Return volume (m^3), size (radius, length without caps, m), protrusion (m) of the capsule around a cylinder.
 
-    With the capsule radius R, the rims of the cylinder of radius r lie on the caps, which begin sqrt(R^2 - r^2) before
-    the cylinder's ends.
+    The capsule has the least volume. With its radius R, the rims of the cylinder of radius r lie on the caps, which
+    begin sqrt(R^2 - r^2) before the cylinder's ends.
     """
     largest = float(np.hypot(radius, length / 2))
     # dense near the cylinder's radius, where the cap length changes most
@@ -226,7 +226,7 @@ class RigidParts:
         return parts
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
-        """Return the joints between two rigid parts: first those up to the part that carries both, then those down."""
+        """Return the joints from one rigid part up to the part that carries both, and those down to the other part."""
         up, down = self._joints_above(first), self._joints_above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
@@ -246,7 +246,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of rigid parts among `bodied` between which no other part of `bodied` lies in the tree."""
+        """Return the pairs of parts with bodies (`bodied`) that no other part with bodies separates in the tree."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)

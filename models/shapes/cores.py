@@ -82,7 +82,7 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return the root of a squared distance or, if this may be too large by `excess`, a lower bound of the distance."""
+    """Return the root of a squared distance, or a lower bound of the root if the square may be `excess` too large."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
@@ -228,7 +228,7 @@ def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> E
 def _segment_box_square(
     middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the squared distance of a segment (in the box's axes) from a box, plus `weight` * (offset from middle)^2.
+    """Return the least squared distance of a segment's points middle + s u from a box, plus `weight` s^2, in box axes.
 
     The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
     weight s plus, for each axis, u_k times the excess of x_k over the box, which is zero inside and linear outside. The
@@ -255,7 +255,7 @@ def _segment_box_square(
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return 1 for that of three components with the largest ratio of magnitude to its entry in `sizes`, else 0."""
+    """Return 1 for the component whose magnitude is largest relative to its entry in `sizes`, 0 for the other two."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])

@@ -177,7 +177,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
-    """Return parameters, basis and volume of the smallest of k capsules around points, one per basis, (k, 3, 3)."""
+    """Fit a capsule to points for each of k bases (k, 3, 3); return parameters, basis and volume of the smallest."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -217,7 +217,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the parts into which a plane splits a mesh so that their covers are smallest, or one part if none does."""
+    """Split a mesh at the plane that gives its parts the smallest covers; return one part if no plane divides it."""
     points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
@@ -250,7 +250,7 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _volume_samples(points: Array) -> tuple[Array, float]:
-    """Return sample points, (k, 3), to estimate volumes of covers of a point set, and the volume of their box."""
+    """Return sample points, (k, 3), to estimate volumes of covers of points, and the volume of the sampled box."""
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
     # The additive recurrence of the generalised golden ratio in three dimensions, the root of x^4 = x + 1.
@@ -267,7 +267,7 @@ def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
 
 
 def _representative_triangles(triangles: Array, frame: Array) -> Array:
-    """Return all triangles of a mesh or, if many, the largest ones, and extreme vertices as degenerate triangles."""
+    """Return all triangles of a small mesh; of a large one, the largest ones and extreme vertices (as triangles)."""
     if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
@@ -296,7 +296,7 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
-    """Return a box of nearly least volume around points, with a face and an edge along those of their convex hull."""
+    """Return a box of nearly least volume around points, with a face and an edge parallel to those of their hull."""
     frames = [_principal_axes(points)]
     try:
         hull = convex_hull(extreme_points)

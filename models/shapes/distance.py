@@ -78,7 +78,7 @@ def distance(
     *,
     rounding: float = 0.0,
 ) -> Expression:
-    """Return the signed distance of two shapes, at poses that may be symbols, as an expression, m. Shape (1, 1).
+    """Return the signed distance of two shapes as an expression; their poses may be symbols. Shape (1, 1), m.
 
     The distance is negative for overlapping shapes; its gradient points out of the overlap. Without rounding it is
     exact for spheres, capsules, boxes and half-spaces, and for the hull of a `Polytope` beside a half-space. Any other
@@ -159,7 +159,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from n pairs of shapes to their distances and the gradients, as (moment, force).
+    """Return the CasADi Function from n pairs of shapes to the distances and, as wrenches, the distances' gradients.
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first

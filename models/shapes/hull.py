@@ -103,7 +103,7 @@ def _convex_hull(points: Array) -> Hull:
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return one index, (f,), for each group of equal unit normals, and for each of the k normals its group, (k,)."""
+    """Return one index, (f,), from each group of equal unit normals, and the group's number for each normal, (k,)."""
     close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)

@@ -183,7 +183,7 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
 
 def _read_stl(file: Path, data: bytes) -> Triangles:
-    """Read a binary or text STL file, told apart by the size of the file, since both kinds may begin with "solid"."""
+    """Read a binary or text STL file; the size of the file decides which, since both kinds may begin with "solid"."""
     header = data[:STL_HEADER_BYTES]
     count = int.from_bytes(header[-4:], "little") if len(header) == STL_HEADER_BYTES else -1
     exact = count >= 0 and len(data) == STL_HEADER_BYTES + STL_RECORD.itemsize * count
@@ -232,7 +232,7 @@ def _merge_vertices(corners: Array) -> Triangles:
 
 
 def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the distinct rows of a table in sorted order, and each row's number among these rows.
+    """Return the indices of a table's distinct rows in sorted order, and each row's number among the distinct rows.
 
     Several times faster than `np.unique` with an axis.
     """
@@ -407,7 +407,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace node instances in a Collada document by copies of the nodes; raise ModelError if these are too many."""
+    """Replace node instances in a Collada document by copies of the nodes; raise ModelError if copies are too many."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 

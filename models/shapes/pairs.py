@@ -199,7 +199,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 
 
 def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
-    """Return the pairs of links whose collision check an SRDF file disables, without pairs with unknown links."""
+    """Return the pairs of links whose collision check an SRDF file disables, except pairs with unknown links."""
     known = {link.name for link in robot.links}
     root = parse_urdf(source)
     if root.find("joint") is not None:
@@ -253,7 +253,7 @@ class _PairClassifier:
     _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why two bodies need no check, or None, and whether hulls of meshes replace covers that always collide.
+        """Return why two bodies need no check (None if they need one), and whether hulls replace covers in the check.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -299,7 +299,7 @@ class _PlacedBody:
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies and the joints between their rigid parts, up and then down the tree."""
+    """Two bodies, the joints from the first one's rigid part up the tree, and those down to the second one's part."""
 
     robot: Robot
     first: _PlacedBody
@@ -336,9 +336,9 @@ class _BodyPair:
         return NEVER
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds, m, of the distance at joint vectors (k, dof), and at which the bounding balls are close.
+        """Return lower bounds, m, of the distance at joint vectors (k, dof), and whether the bounding balls are close.
 
-        They are close where they do not prove a distance greater than `above`, m. The shapes then give the bound.
+        Balls are close if they do not prove a distance greater than `above`, m; then the shapes give the bound.
         """
         (turn, shift), first, second = self._relative(q), self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius

@@ -65,7 +65,7 @@ class _SweptCore:
 
 
 class Polytope(_SweptCore):
-    """A shape that distance computations replace by its `hull`, a convex polytope with a pose of its own."""
+    """A shape with a pose of its own that distance computations replace by its `hull`, a convex polytope."""
 
     AXES: ClassVar[tuple[str, ...]] = ("rotation",)
     position: ArrayInput
@@ -202,7 +202,7 @@ class Box(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Corners of the box, (8, 3), m, with z varying fastest and x slowest; ModelError for an infinite edge."""
+        """Corners of the box, (8, 3), m; z varies fastest, x slowest. Raises ModelError for an infinite edge."""
         size = require.array("box: size", self.size, (3,), unit="m")
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 

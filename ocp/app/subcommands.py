@@ -285,7 +285,7 @@ def read_robot(options: argparse.Namespace) -> Robot:
 
 
 def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
-    """Return the base pose in world from the option --mount: translation (3,), m, and rotation matrix (3, 3)."""
+    """Return the base's pose in the world from the option --mount: translation (3,), m, and rotation matrix (3, 3)."""
     numbers = options.mount or [0.0] * 6
     return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)
 

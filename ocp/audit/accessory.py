@@ -65,9 +65,9 @@ class AccessoryProblem:
     def _units(self) -> None:
         """Choose scales of the variables that make the backward sweep well conditioned and do not affect the results.
 
-        Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
-        Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
-        are scaled by their sizes, or their values if they never move.
+        Horizon and states are scaled by their sizes; states that hardly move, by the sizes of other states of the same
+        unit. Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without
+        curvature are scaled by their sizes, or their values if they never move.
         """
         sizes, horizon = self.along.sizes, [self.along.solution.horizon] if self.free else []
         curvature = np.abs(np.einsum("kii->ki", self.curved)).mean(axis=0)
@@ -114,14 +114,14 @@ class AccessoryProblem:
 
     @cached_property
     def linear_controls(self) -> np.ndarray:
-        """Whether the Hamiltonian is linear in each control. Shape (nu,), bool."""
+        """Mask of the controls in which the Hamiltonian is linear. Shape (nu,)."""
         curvature = np.abs(self.curved * self.range * self.range[:, None]).max(axis=(0, 2), initial=0.0)
         gradient = np.abs(slope(self.along, self.adjoint.costate) * self.range).max(initial=0.0)
         return np.asarray(curvature <= FLAT_SHARE * max(float(curvature.max(initial=0.0)), float(gradient)))
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Gradient of horizon times augmented Hamiltonian in scaled controls; 0 if linear in them. Shape (M, nu)."""
+        """Gradient of horizon times augmented Hamiltonian in scaled controls; 0 for linear controls. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -144,7 +144,7 @@ class AccessoryProblem:
     def cost_scale(self) -> float:
         """Second-order change of the cost if states and controls change by their characteristic sizes.
 
-        In units of cost. For states only the running and the terminal cost count, for controls the Hamiltonian.
+        Changes of states change the running and the terminal cost; changes of controls, the Hamiltonian.
         """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
@@ -152,7 +152,7 @@ class AccessoryProblem:
 
     @property
     def negligible_cost(self) -> float:
-        """Largest cost that counts as zero, because a plan does not resolve changes of this cost reliably."""
+        """Largest cost that counts as zero, because a plan does not resolve cost changes of this size reliably."""
         return max(LIMIT_SHARE * self.cost_scale, LIMIT_SHARE**2 * self.along.slope_size)
 
     @property
@@ -206,7 +206,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find controls that switch between limits inside an interval, and the cost's curvature in the switch times."""
+        """Find controls that switch between limits in an interval, and curvatures of the cost in the switch times."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -228,7 +228,7 @@ class AccessoryProblem:
 
 
 def obstacle(form: Formulation) -> str:
-    """Return why the second variation is unknown for all plans of a problem; "" if it can be computed."""
+    """Return why the second variation along plans of a problem cannot be computed; "" if there is no such reason."""
     last = ca.vertcat(form.end.expression, form.terminal)
     if ca.depends_on(last, form.u0):
         return "the control at the start enters the conditions at the end"
@@ -255,8 +255,8 @@ def curved_ends(form: Formulation) -> Any:
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the Hessian of the Lagrangian and the gradients of active constraints at a plan's end, then at its start.
 
-    The Lagrangian is the terminal cost plus multipliers times constraints. All refer to the scaled variations z.
-    Inequalities are active if they have multipliers, state bounds if the plan rests on them.
+    The Lagrangian is the terminal cost plus multipliers times constraints. Derivatives are with respect to the scaled
+    variations z. Inequalities with multipliers are active, and so are state bounds on which the plan rests.
     """
     along, ends = accessory.along, accessory.adjoint.ends
     form, solution, (low, high) = along.form, along.solution, along.bounds

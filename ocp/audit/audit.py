@@ -61,7 +61,7 @@ class Finding:
 
     @property
     def passed(self) -> bool:
-        """Whether the value does not exceed the limit, if there is a limit; nan does not pass."""
+        """Whether the value is at most the limit, or there is no limit; nan exceeds every limit."""
         return self.limit is None or bool(self.value <= self.limit)
 
 
@@ -73,7 +73,7 @@ class Audit:
         name: Name of the problem.
         findings: Results of the checks, one for every check.
         undecided: Why it is undetermined whether the plan is a local minimum, or "".
-        remarks: What whoever runs the plan should know, although it changes no verdict.
+        remarks: Facts that a user of the plan should know, although they change no verdict.
         constraints: Largest violation of every bound and constraint on the fine grid by name; 0 if it is satisfied.
         integration_error: Largest difference of the plan's states from the re-integrated ones over the whole horizon,
             relative to the size of each state.
@@ -349,7 +349,7 @@ def clearance_finding(clearance: Clearance, limit: float) -> Finding:
 
 
 def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) -> Finding:
-    """Return the finding about the deviation of a plan's states from those re-integrated under its controls."""
+    """Return the finding about the deviation of a plan's states from states re-integrated under its controls."""
     notes = [] if motion.breakdown_time is None else [f"the integration broke down at {motion.breakdown_time:.6g} s"]
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
@@ -358,7 +358,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return a finding that compares a constraint's largest violation with `tolerance` or a share of its magnitude."""
+    """Return a finding: a constraint's largest violation, compared with `tolerance` or a share of the values' size."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))

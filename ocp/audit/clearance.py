@@ -147,7 +147,7 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Text, in a list, on the pairs of bodies that are left out by assumption; an empty list if there are none."""
+        """List with one text about pairs of bodies that are left out by assumption; empty without such pairs."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
@@ -359,8 +359,8 @@ class _Search:
     def _sufficient_bounds(self) -> np.ndarray:
         """Return for each pair the lower distance bound that suffices to stop halving its intervals. Shape (n,), m.
 
-        The pair with the smallest margin is resolved to a relative accuracy. For the others it suffices that their
-        margins are no smaller.
+        The pair with the smallest margin is resolved to a relative accuracy. For all other pairs it suffices that their
+        margins are at least as large.
         """
         margin = self.best - self.apart.least
         smallest = max(float(margin.min()), 0.0)
@@ -369,7 +369,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of distances, m, in K time intervals, and for n pairs the bounds that end bisection.
+        """Return lower distance bounds, m, in K time intervals, and the bound at which each pair's bisection ends.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.

@@ -85,7 +85,7 @@ class IntegratedMotion(NamedTuple):
 
 
 def corrected_motion(along: Linearisation) -> IntegratedMotion | None:
-    """Return the motion under the controls of a plan, by Newton corrections of its states; None without convergence."""
+    """Return the motion under the controls of a plan, by Newton corrections of the states; None without convergence."""
     if not along.finite:
         return None
     newton = _Newton(along)
@@ -107,7 +107,7 @@ class _Converged(NamedTuple):
 
 
 class _Newton:
-    """Newton's method that corrects the states of a plan, on its fine grid, to the motion under its controls."""
+    """Newton's method that corrects the states of a plan, on the plan's fine grid, until they satisfy the dynamics."""
 
     def __init__(self, along: Linearisation) -> None:
         self.along, form, grid = along, along.form, along.grid
@@ -172,7 +172,7 @@ class _Newton:
         """Correct the states of the plan until they satisfy its dynamics; None if the corrections do not converge.
 
         Args:
-            chained: Whether one motion starts from the plan's first state, not one in every interval.
+            chained: Whether one motion starts from the plan's first state, not a separate motion in every interval.
             rate: Ratio of successive corrections, as far as it is known.
         """
         nx, x, integral, error, last = self.along.form.nx, self.x, self.first, self.own, np.inf
@@ -210,7 +210,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate errors ``ends`` (N, nx) of intervals and jumps of ``x`` between them by the linearised dynamics."""
+        """Propagate errors ``ends`` (N, nx) of intervals, and jumps of ``x`` between these, by linearised dynamics."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):

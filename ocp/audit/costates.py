@@ -237,7 +237,7 @@ def _state_limit_multipliers(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the multipliers of state limits in mesh interval ``k`` that best explain the reported costates.
 
-    Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
+    Values at the Gauss points (q, m) are multiplied by quadrature weights; values at both ends (2, m) are impulses.
     """
     along, (q, nx) = back.along, (back.along.shape[1], back.along.form.nx)
     points, size, unit, weight = slice(k * q, (k + 1) * q), along.state_size, along.control_size, along.weight
@@ -365,7 +365,7 @@ class EndLimits:
 
     @property
     def scaled_slope(self) -> np.ndarray:
-        """Gradients of limits towards violation in scaled states and horizon, with 1-norm 1. Shape (K, 2 nx + 1)."""
+        """Gradients of limits in scaled states and horizon, towards violation, of 1-norm 1. Shape (K, 2 nx + 1)."""
         return np.asarray(self.slope * (self.sign / self.reach)[:, None] * self.unit)
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

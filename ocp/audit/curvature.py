@@ -254,7 +254,7 @@ class _Linearised(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """One stage (mesh interval) of the sweep, reduced to those f control variations that its constraints leave free.
+    """One stage (mesh interval) of the sweep, reduced to the f control variations that its constraints leave free.
 
     Attributes:
         lift: (z, 1, controls) as a function of (z, 1) and the free variations. Shape (nz + 1 + q nu, nz + 1 + f).
@@ -367,10 +367,10 @@ def _confirmed_negative(
     controls: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> Curvature:
-    """Return the result of a backward sweep with negative curvature, undetermined if no admissible variation has it.
+    """Return the result for negative curvature, undetermined if no admissible variation of the plan has this curvature.
 
-    End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
-    freedom.
+    End conditions that path constraints imply are linearly dependent up to the error of the plan. A direction along
+    which only this error is left does not count as free.
 
     Args:
         gains: Optimal feedback of the stages from the last one on; the variation follows it.
@@ -407,7 +407,7 @@ def _confirmed_negative(
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return why a stage is inconclusive if the Hamiltonian is linear in one of its controls, else "".
+    """Return why a stage is inconclusive if the Hamiltonian is linear in one of the controls, else "".
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.

@@ -59,7 +59,7 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: Any) -> Limits:
-        """Return the limits at those points of the plan that a slice or an array of indices selects."""
+        """Return the limits at the points of the plan that a slice or an array of indices selects."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
@@ -80,7 +80,7 @@ class Limits:
 
     @property
     def sides(self) -> tuple[tuple[np.ndarray, np.ndarray, float], ...]:
-        """Mask of possible activity, distances, multiplier sign of upper limits and equalities, then of lower ones."""
+        """Mask of potentially active limits, distances, multiplier sign: for upper (or equal), then lower limits."""
         return (self.upper, self.above, 1.0), (self.lower & ~self.equal, self.below, -1.0)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
@@ -296,7 +296,7 @@ class Linearisation:
         self.node_limits_x = np.hstack([np.tile(own, (n + 1, 1, 1)), rows_x])
 
     def _arcs(self) -> None:
-        """Add to the control limits the equations from state equalities differentiated in time until controls appear.
+        """Differentiate state equalities in time until controls appear; add these equations to the control limits.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then

@@ -407,7 +407,7 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return a plan's excess cost for given multipliers, plus the residuals of the optimality conditions, as costs."""
+    """Return the sum of a plan's estimated excess cost and the residuals of its costate conditions, in cost units."""
     assert curved is not None
     loss = _total_loss(_loss_by_interval(along, multipliers, curved), multipliers)
     return loss + multipliers.total + multipliers.ends.transversality

@@ -70,7 +70,7 @@ def global_optimum(along: Linearisation, negligible: float) -> str:
 def cost_bound(along: Linearisation) -> float:
     """Return a lower bound of the cost of all plans within the bounds of states, controls and horizon.
 
-    It is the sum of the terminal cost's bound and the horizon times that of the running cost, by interval arithmetic on
+    It is the bound of the terminal cost plus the horizon times the bound of the running cost, by interval arithmetic on
     all states and controls at once; -inf for operations without interval rules.
     """
     form, places = along.form, along.form.bounds.places
@@ -133,8 +133,8 @@ def is_convex(along: Linearisation) -> bool:
 def clebsch(along: Linearisation, costate: np.ndarray, control: int) -> np.ndarray:
     """Return the generalised Legendre-Clebsch term of a control that enters linearly, along a plan. Shape (M,).
 
-    It is -d/du of the second time derivative of H_u along the extremal, of one control. A minimum on a singular arc
-    requires that it is not negative (Kelley, Kopp, Moyer 1967).
+    It is -d/du of the second time derivative of H_u along the extremal, for this control u alone. A minimum on a
+    singular arc requires that it is not negative (Kelley, Kopp, Moyer 1967).
     """
     form = along.form
     lam = form.sym("lam", form.nx)
@@ -178,8 +178,8 @@ def find_control_multipliers(
     """Return the multipliers of control limits at the Gauss points that best fit given costates.
 
     They minimise the gradient of T H in the controls, in units of their sizes. A limit that a plan reaches only at
-    single points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that
-    loses less than the gradient.
+    single points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where the
+    loss due to this gap is less than that due to the gradient.
 
     Args:
         along: The plan.
@@ -388,8 +388,8 @@ def needle_loss(along: Linearisation, costate: np.ndarray) -> np.ndarray:
     """Return the cost, to first order, that needle variations of the controls save in each interval. Shape (N,).
 
     It is the integral of H(u) - H(v), Weierstrass's excess, over the best v of a grid of admissible values of each
-    control. A plan may be a minimum among all with controls near its own and lose cost to these. The loss is zero
-    without a grid if the Hamiltonian is at most quadratic in the controls, where its curvature decides.
+    control. A plan may be a minimum among plans with similar controls and still cost more than a needle variation. The
+    loss is zero without a grid if the Hamiltonian is at most quadratic in the controls, where its curvature decides.
     """
     form, (n, q), mixed = along.form, along.shape, along.mixed
     lam = form.sym("lam", form.nx)

@@ -31,7 +31,7 @@ from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
 @dataclass(frozen=True)
 class Reintegration:
-    """States that integration of the dynamics under the controls of a plan yields, on the fine grid of the plan.
+    """States on the fine grid of a plan that result from integrating the dynamics under the plan's controls.
 
     Attributes:
         grid: The plan on its fine grid, with M samples.
@@ -279,7 +279,7 @@ def step_function(form: Formulation, nodes: np.ndarray) -> Any:
 
 
 def _control_columns(solution: Solution) -> np.ndarray:
-    """Return the divided differences of the controls in each interval, its start and its width. Shape (N, nw + 2)."""
+    """Return divided differences of the controls in each interval, with its start and width. Shape (N, nw + 2)."""
     curve = solution.control_interpolant
     differences = newton_coefficients(curve.nodes, curve.values).reshape(len(curve.values), -1)
     return np.column_stack([differences, curve.breaks[:-1], np.diff(curve.breaks)])

@@ -186,7 +186,7 @@ def _sizes_of(
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
-    """Return the smallest magnitude of the finite, nonzero bounds of each quantity; inf without any. Shape (n,)."""
+    """Return the smallest magnitude of finite, nonzero bounds of each quantity; inf if there are none. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
@@ -300,7 +300,7 @@ def _change_by_variables(
 def row_changes(
     form: Formulation, kind: str, grid: FineGrid, samples: np.ndarray, *, moves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of one kind of constraint at K samples, and their changes if each state or control changes.
+    """Return the values of one kind of constraint at K samples, and their changes when one state or control changes.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -293,7 +293,7 @@ class ArrayFunction:
         return buffer, run, inputs, outputs
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Evaluate the function; return columns as arrays, others as sparse matrices; raise RuntimeError on failure."""
+        """Return the outputs of the function, columns as arrays, others as sparse matrices, or raise RuntimeError."""
         buffer, run, inputs, outputs = self._kept or self._allocate()
         for own, each in zip(inputs, arguments, strict=True):
             own[:] = each.ravel()

@@ -107,7 +107,7 @@ def generate_c(functions: Sequence[Any], name: str, *, header: bool = True) -> l
 
 
 def build_library(contents: Sequence[str], text: Callable[[], str]) -> Path:
-    """Return the path of a shared library compiled from C code, which is taken from the cache if possible.
+    """Compile C code to a shared library, unless the library is in the cache, and return the path of the library.
 
     Ctrl-C and time limits end the compiler.
 
@@ -271,7 +271,7 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 
 
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write the C files of a problem for a controller to a folder, return the folder and raise as `write_c` does."""
+    """Write a problem's C files for a controller to a folder, and return the folder; errors are those of `write_c`."""
     texts = {"curves.h": CURVES, "problem.h": problem_header(form, transcription), "main.c": MAIN, "Makefile": MAKEFILE}
     return write_c(form, controller_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
 
@@ -285,7 +285,7 @@ def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path,
         texts: Contents of the further files by name.
 
     Raises:
-        ProblemError: Some part of the problem has no C, such as an integrator of variable step.
+        ProblemError: A part of the problem cannot be written as C code, such as an integrator of variable step.
         OSError: The folder cannot be written.
     """
     try:

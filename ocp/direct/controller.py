@@ -224,7 +224,7 @@ class Controller:
             Makefile        builds it with `make`
 
         Raises:
-            ProblemError: A part of the problem has no C, such as cvodes.
+            ProblemError: A part of the problem cannot be written as C code, such as cvodes.
             OSError: The folder cannot be written.
         """
         place = Path(checked_path(folder))

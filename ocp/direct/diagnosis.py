@@ -132,7 +132,7 @@ def diagnosis(
 def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]) -> list[str]:
     """Return labels and times of constraints with linearly dependent gradients, in decreasing order of weight.
 
-    They are the constraints with large entries in a vector y with J^T y = 0, found by inverse iteration with J J^T; J
+    Weights are magnitudes of the entries of a vector y with J^T y = 0, found by inverse iteration with J J^T; J
     is the Jacobian of the equations, with rows of length 1, in the variables that are not fixed.
     """
     form, transcription = built.formulation, built.transcription
@@ -262,8 +262,8 @@ class Elastic:
 def elastic_plan(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Elastic | None:
     """Return the plan that meets dynamics and fixed ends, and violates the other constraints as little as possible.
 
-    None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
-    failure, and if no plan is found in the remaining time.
+    Return None if the last iterate satisfies all constraints or is not finite, so that the constraints are not the
+    reason for the failure, or if no plan is found in the remaining time.
 
     Args:
         outcome: Result of the failed solver.
@@ -339,7 +339,7 @@ def elastic_plan(built: Built, outcome: Outcome, arguments: dict[str, np.ndarray
 class _Soft:
     """Limits that the plan of least violation may violate: all but dynamics, fixed ends and the least horizon.
 
-    Rows are numbered before variables. Those with one label share a slack variable.
+    Constraints are numbered before variables. Limits with the same label share a slack variable.
     """
 
     def __init__(self, form: Formulation, transcription: Transcription, arguments: dict[str, np.ndarray]) -> None:
@@ -369,7 +369,7 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return the matrices that combine constraints, variables and slacks to the constraints of the elastic program.
+        """Return the matrices that combine constraints, variables and slacks in the constraints of the elastic program.
 
         The constraints are R g(v) + C (v, slack), with n variables v, m constraints g of the problem, and k slacks.
         """

@@ -149,7 +149,7 @@ class Prepared:
             time_limit: Wall time, s.
             shift: Number of intervals by which a receding horizon has advanced since the guess, a plan on equal
                 intervals. Each interval starts from the values, limits and multipliers of the plan so many intervals
-                later; the last ones from their own.
+                later; the last intervals start from their own values.
             start: ``guess``, or ``displaced guess``: displaced by seeded random shares of the sizes of the variables.
 
         Raises:
@@ -175,7 +175,7 @@ class Prepared:
             guess: As of :meth:`solve`. A solution of this prepared problem is written as it is.
 
         Raises:
-            ProblemError: Wrong arguments, or a part of the problem has no C, such as cvodes.
+            ProblemError: Wrong arguments, or a part of the problem cannot be written as C code, such as cvodes.
             OSError: The folder cannot be written.
         """
         form, transcription = self.formulation, self.transcription

@@ -223,9 +223,9 @@ def sizes_along(
 
 
 def _displaced(pattern: Pattern, point: np.ndarray, sizes: np.ndarray, ends: Bounds) -> np.ndarray:
-    """Return a point with each state and control displaced by a share of its magnitude (of its range if unknown).
+    """Return a point with each state and control displaced by a share of its magnitude or, if unknown, of its range.
 
-    A derivative such as the cosine of a right angle may vanish at the guess, but does so nowhere near it.
+    A derivative such as the cosine of a right angle may vanish at the guess, but not at a displaced point.
 
     Args:
         sizes: Known sizes of states, controls and horizon, 0 if unknown. ends: Their bounds.

@@ -207,7 +207,7 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the controls with respect to k parameters, from those of all variables, at M times.
+    """Return derivatives of the controls at M times with respect to k parameters, from derivatives of all variables.
 
     Shape (M, nu, k). The controls are linear in the variables, so that differences are exact.
     """

@@ -219,9 +219,9 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare path constraints at all mesh nodes, at the first only those that initial states do not determine.
+        """Declare path constraints at all mesh nodes; at the first, omit those that initial states determine.
 
-        ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
+        ``controls`` (nu, N + 1) are variable indices of the controls at the nodes; rows without controls ignore them.
         """
         nodes = np.arange(self.intervals + 1)
         states = self.layout.node[: self.formulation.nx]

@@ -164,7 +164,7 @@ class BoundaryProblem:
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and costates at points of a segment, and integrals over the segment; nan if this fails.
+        """Return states and costates at points of a segment, and integrals over it; nan if integration fails.
 
         Shapes (2 nx, places) and (2,).
         """

@@ -23,7 +23,7 @@ from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Criteria by which a direct solution is rejected as an initial guess (seed), which may be coarse.
+    """Criteria by which a direct solution, which may be coarse, is rejected as an initial guess (seed).
 
     Attributes:
         inside: Distance from both bounds, relative to their range, beyond which a control is inside them.

@@ -42,7 +42,7 @@ from ocp.problem.values import identity
 
 
 class Enclosure(NamedTuple):
-    """Bounds of the values and slopes of expressions over intervals of their only variable; they may be infinite.
+    """Bounds, possibly infinite, of the values and slopes of expressions over intervals of their only variable.
 
     Attributes:
         low, high: Bounds of the values. Shape (M, n) for M intervals and n expressions.
@@ -114,7 +114,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; if ``exponent`` is given, it is constant."""
+    """Return the partial derivatives of an operation as an SX function; ``exponent`` is None unless constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])

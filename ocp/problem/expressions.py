@@ -200,9 +200,9 @@ def _columns(array: np.ndarray) -> int:
 
 
 def read_positive(what: str, value: Value, size: int, *, scale: bool = False) -> np.ndarray | None:
-    """Return ``size`` positive numbers, given one number for all entries or one for each; None for None. Shape (size,).
+    """Return ``size`` positive numbers, given one number for all or one for each entry; None if the value is None.
 
-    Those of a ``scale`` are finite, or nan where the scale is unknown.
+    The numbers of a ``scale`` are finite, or nan where the scale is unknown.
     """
     if value is None:
         return None

@@ -242,7 +242,7 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """Horizon, s, of a problem with signals (known functions of time), which require a fixed horizon; else 1."""
+        """Horizon, s, if the problem has signals (known functions of time), which need a fixed horizon; 1 otherwise."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(

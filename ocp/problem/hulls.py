@@ -170,9 +170,9 @@ class HullPairs:
 class CoveredPairs:
     """Pairs of bodies, and pairs of smaller shapes that cover some of the bodies and give sharper distance bounds.
 
-    Covering pairs contain the two bodies between them, so the smallest of their distances is a lower bound of the
-    distance of the pair. The distance of the hulls is another one; the larger bound counts. Unlike a hull, covers of
-    parts follow concavities.
+    The covering pairs of a pair together contain its two bodies, so the smallest of their distances is a lower bound of
+    the distance of the pair. The distance of the hulls is another lower bound; the larger bound counts. Unlike a hull,
+    the covers of parts follow concavities.
 
     Attributes:
         rows: The n pairs, then the covering pairs, each observed from the frame of its pair. Shape (n + m, 3).
@@ -187,9 +187,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return index arrays (R,) of the pairs of shapes that represent pairs of bodies: into `pair` and into `rows`.
+        """Return indices (R,) into `pair` and `rows` of the given pairs, then of the covering pairs of their bodies.
 
-        The first of them are the K pairs of bodies in `pair`; then come the shapes that cover these bodies.
+        The index into `pair` of a covering pair is that of the given pair whose bodies it covers.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -201,7 +201,7 @@ class CoveredPairs:
         """Return, for each pair of bodies, the index of the pair of shapes that determines its distance. Shape (K,).
 
         Args:
-            place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
+            place: First result of `of`. gap: Distances of the pairs of shapes. Shape (R,), m. count: Number K of pairs.
         """
         rows = np.arange(count)
         order = count + np.lexsort((gap[count:], place[count:]))
@@ -215,7 +215,7 @@ class SeparatingDirections(NamedTuple):
     """Directions of the shortest distance between the two bodies, or the two covering shapes, of each of R pairs.
 
     Attributes:
-        place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
+        place, row: From `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
             frame of observation. Shape (R, 3).
     """
 
@@ -319,7 +319,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield the groups of the pairs `rows` by kinds of hulls, with their indices in `rows` and in the group."""
+        """Yield each group of pairs with the same kinds of hulls, and its pairs' indices in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -327,7 +327,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Group pairs (n, 3) of bodies by the kinds of the hulls; a pair is two bodies and a frame (-1: the world)."""
+    """Group pairs (n, 3) of bodies by the kinds of the hulls; a row has two bodies and a frame (-1: the world)."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -451,7 +451,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Check the pairs of bodies that together contain another pair; return them keyed by the index of that pair."""
+    """Check and return the pairs of bodies that together cover another pair, by the index of the covered pair."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:

@@ -172,7 +172,7 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Outcome of a job: key of its task, result (None: to be sent again), and number of workers that ended with it."""
+    """Outcome of a job: key of its task, result (None: send the task again), and number of workers that it ended."""
 
     key: str
     payload: Payload | None
@@ -443,7 +443,7 @@ class PendingTasks:
         return Job(key, self.texts[key], None if record is None else self.store.payload(record))
 
     def _neighbour(self, key: str) -> str | None:
-        """Return the key of the nearest predecessor of a task in its chain of similar tasks that succeeded, or None."""
+        """Return the key of the nearest predecessor, in a task's chain of similar tasks, that succeeded, or None."""
         parent = self.parents[key]
         while parent is not None and self.results[parent].status != "done":
             parent = self.parents[parent]

@@ -321,7 +321,7 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Write the files of a record and then the record; replace symbolic links that have names of these files."""
+        """Write the files of a record and then the record; replace symbolic links that are at their paths."""
         path = self._place(record["key"])
         for link in (path.parent, path, *(file_at(path, i) for i in range(len(files)))):
             if os.path.islink(link):
@@ -444,7 +444,7 @@ class Result:
 
     def row(self) -> dict[str, Any]:
         """Return the result as a table row with the columns ``COLUMNS``, ``task.NAME`` for the entries of the task, and
-        ``result.NAME`` for those of the value.
+        ``result.NAME`` for the entries of the value.
 
         Longer entries of a task are given as JSON.
         """

@@ -210,13 +210,13 @@ def source_version(function: Any) -> str:
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
     """Return for each task the key of its neighbour, the similar task whose result is its initial guess.
 
-    The first task has None; neighbours come first in the order of the dictionary. Ordered by their keys, which looks
-    random, the tasks form generations of 1, 1, 2, 4, 8, ... tasks. The neighbour of a task is the nearest task of all
+    The first task has no neighbour (None); each neighbour precedes its tasks in the dictionary. In the order of their
+    keys (hashes), tasks form generations of 1, 1, 2, 4, 8, ... The neighbour of a task is the nearest task of all
     earlier generations, in the space of the numbers `names` of a task, each divided by its range. Neighbours thus come
     closer as the tasks get denser, and no chain is longer than log2 of the number of tasks.
 
     Raises:
-        ProblemError: A task lacks these numbers, or has not as many as the others; names the task.
+        ProblemError: A task lacks these numbers, or has more or fewer than the others; the message shows the task.
     """
     order = sorted(tasks)
     rows = [coordinates_of(tasks[key], names) for key in order]
@@ -241,7 +241,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
 
 
 def coordinates_of(task: Any, names: Sequence[str]) -> Array:
-    """Return the numbers of a task with given names as a point, for distances between tasks. Shape (n,)."""
+    """Return the numbers that a task has under given names as a point, to compare tasks by distance. Shape (n,)."""
     parts = []
     for name in names:
         value = task.get(name) if isinstance(task, Mapping) else None

@@ -230,7 +230,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below 1 s in which times are plausible ("" if none), and the highest speed for times in seconds.
+    """Return the unit below 1 s in which times are plausible ("" if none), and the highest speed if the unit is 1 s.
 
     The speed is relative to the joint's limit, or to 1 without one. Times are plausible if the samples are at 10 kHz or
     less, and the fastest joint moves at 1 to 1000 % of its limit.
@@ -424,7 +424,7 @@ def _check_followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: li
 
 
 def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
-    """Return a suspicion if times given as seconds look like a smaller unit or like sample numbers; else an empty list.
+    """Return a list with one suspicion if times given as seconds look like a smaller unit or sample numbers, else [].
 
     A smaller unit is plausible, the samples are a second or more apart, and no joint is faster than 0.5 % of its limit.
     Sample numbers: 50 or more, spaced by one, and no joint is faster than 10 %.
@@ -444,9 +444,9 @@ def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """Return a suspicion if the columns of two joints seem exchanged: swapping them makes the motion far simpler.
+    """Return a list with one suspicion if swapping the columns of two joints makes the motion far simpler, else [].
 
-    Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
+    Either one joint is outside its limits most of the time, and all are inside after the exchange, or the tip moves
     straight or at constant speed only after the exchange. The latter requires three joints that do not move in
     proportion, because motions between two configurations are simple by chance, and a `tip` that is known: all joints
     are known (`columns` has their indices in the joint vector), and the base does not float.

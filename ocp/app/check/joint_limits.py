@@ -134,7 +134,7 @@ class PiecewisePolynomial:
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return values (M, n) of polynomials with given indices (M,) at fractions (M,), 0 to 1, of their intervals."""
+        """Return values (M, n) in the intervals with given indices (M,) at fractions (M,), 0 to 1, of the intervals."""
         own, s = self.coefficients[interval], fraction[:, None]
         degree = own.shape[1] - 1
         terms = (comb(degree, k) * s**k * (1 - s) ** (degree - k) * own[:, k] for k in range(degree + 1))
@@ -197,7 +197,7 @@ class Motion:
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
-        """Return the same samples with another rule of interpolation; raise ProblemError if it needs missing values."""
+        """Return the same samples with another rule of interpolation; raise ProblemError if they lack values for it."""
         missing = "velocities" if self.v is None else "accelerations" if self.a is None and rule == "quintic" else None
         if rule != "linear" and missing:
             words = f"the rule {rule!r} needs {missing}, which are not given for every joint; omit the rule"
@@ -275,7 +275,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least maxima of a quantity and its negative, by interval, over all motions through the samples.
+        """Return, for each interval, the least maximum of a quantity, and of its negative, that the samples permit.
 
         Acceleration: a motion through two samples needs the least acceleration if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -416,7 +416,7 @@ class _Side(NamedTuple):
     """Largest values of a joint quantity towards the upper or the lower limit, in each interval between samples.
 
     Values (N,) and limit are multiplied by `sign`: 1 for the upper limit, -1 for the lower. They are at most what every
-    motion through the samples needs; `eased` says that the interpolant violates the limit, but not every such motion.
+    motion through the samples needs; `eased` is true if the interpolant violates the limit, but not every such motion.
     """
 
     sign: float

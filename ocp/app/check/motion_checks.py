@@ -269,7 +269,7 @@ def check_momentum(findings: Findings, machine: FreeFloating, motion: Motion, ba
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine with joint limits widened to contain a motion, and finite limits of all prismatic joints."""
+    """Return the machine with joint limits wide enough for a motion, and finite for all prismatic joints."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -359,7 +359,7 @@ def check_clearance(findings: Findings, scene: CollisionScene, motion: Motion, b
 
 
 def _verdict(pair: ClosestPair) -> RowVerdict:
-    """Return the verdict on the distance between two bodies, which may be below the required one by a tolerance."""
+    """Return the verdict on the distance between two bodies, which may be a tolerance below the required distance."""
     return RowVerdict.of(pair.distance < pair.required - CLEARANCE_TOLERANCE_M, pair.missed > CLEARANCE_TOLERANCE_M)
 
 

@@ -426,7 +426,7 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check times (M,), joint positions, and rates and accelerations if not None, (M, n), against a robot's limits."""
+    """Check times (M,), positions and, unless None, rates and accelerations, (M, n) each, against a robot's limits."""
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem
         frame = machine.world_from_base(())
@@ -451,6 +451,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return the sort key of a table row: whether it failed, whether it is undetermined, value relative to limit."""
+    """Return the sort key of a table row: (whether failed, whether undetermined, value relative to the limit)."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

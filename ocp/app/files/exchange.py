@@ -163,7 +163,7 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of an MCAP log, also those in chunks, in file order; raise ValueError for too large ones."""
+    """Yield the records of an MCAP log in file order, also those in chunks; raise ValueError if one is too large."""
     from mcap.exceptions import EndOfFile
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader

@@ -161,7 +161,7 @@ class Program:
         return "\n".join([head, *(str(note) for note in self.notes)])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = NO_ROTATION) -> Program:
-        """Return the program with its origin moved to a pose in world: position, m, and unit quaternion.
+        """Return the program with its origin moved to a given pose in the world: position, m, and unit quaternion.
 
         Raises:
             ModelError: The position is invalid, or the orientation is not a unit quaternion.

@@ -165,7 +165,7 @@ _NO_KEY = object()
 
 
 def read_tree(file: FileName, kind: str) -> Any:
-    """Return the contents of a JSON file or of a YAML file's first document; raise ProblemError for invalid ones."""
+    """Return the contents of a JSON file or of a YAML file's first document; raise ProblemError if they are invalid."""
     text = "\n".join(read_lines(file, longest=None))
     try:
         if kind != "json":
@@ -200,7 +200,7 @@ class _Container:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append an item to the list, or a key or value to the mapping; `count` includes the values nested in it."""
+        """Append an item to the list, or a key or value to the mapping; `count` is the number of scalars in `value`."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):

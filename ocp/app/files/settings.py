@@ -159,12 +159,12 @@ class TomlTable:
         return {key: float(value) for key, value in table._values.items()}
 
     def values(self, readers: Readers) -> dict[str, Any]:
-        """Return the entries of the table that `readers` names, keyed by name, each read by its function."""
+        """Read the entries that have a function in `readers`, and return the values of existing entries by name."""
         values = {name: read(self, name, *arguments) for name, (read, *arguments) in readers.items()}
         return {name: value for name, value in values.items() if value is not None}
 
     def build(self, kind: Callable[..., T], readers: Readers, **arguments: Any) -> T:
-        """Return what the class or function `kind` builds from table entries and arguments; errors state the line."""
+        """Call class or function `kind` with table entries and arguments; return its result. Errors state the line."""
         values = self.values(readers) | arguments
         self.done()
         with located_errors(self):
@@ -300,7 +300,7 @@ def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None
 def joint_values(
     entries: TomlTable, name: str, default: float, allowed: tuple[str, float | None] = (BY_JOINT, None)
 ) -> Any:
-    """Return an entry that gives one number for each joint name as an array (n,); None if the entry is missing.
+    """Return an entry with one number for each joint name, as an array (n,), or None if the entry is missing.
 
     Joints without a number get `default`. `allowed` are the expected values in words, and the number that all are
     above. If there is such a number, the entry may also be one number for all joints, which is returned as it is.

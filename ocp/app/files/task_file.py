@@ -50,7 +50,7 @@ def _duration(entries: TomlTable, name: str, default: Any = None) -> Any:
 
 
 def _velocity(entries: TomlTable, name: str) -> Any:
-    """Read joint velocities, nan where free, or "rest" or "free"."""
+    """Read joint velocities (nan for a free velocity), or the word "rest" or "free"."""
     if isinstance(entries.raw(name), str):
         return entries.choice(name, ("rest", "free"))
     return joint_values(entries, name, np.nan)

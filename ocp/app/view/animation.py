@@ -136,10 +136,10 @@ def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
 
 
 def _controlled_rows(machine: Machine, base: Array) -> list[int]:
-    """Return the rows of the tip's twist that the joints control independently: all rows in which they move the tip, or
-    else the linear ones of these; an empty list if the joints are too few for either.
+    """Return the rows of the tip's twist that the joints control independently, or an empty list if there are none.
 
-    They are those at a random configuration, at which the rank is that of almost all configurations.
+    These are all rows in which the joints move the tip or, if the joints are too few, the linear rows among these. They
+    are computed at a random configuration, where the rank of the Jacobian is that of almost all configurations.
     """
     b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
     jacobian = ca.Function("jacobian", [b, q], [machine.tip_jacobian(b, q)])

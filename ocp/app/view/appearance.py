@@ -88,9 +88,9 @@ class Appearance:
 def appearance_of(
     robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """Return the surfaces with which the links of a robot are displayed, also if the robot was modified after reading.
+    """Return the surfaces with which the links of a robot are displayed, even if the robot was modified after reading.
 
-    `folders` are searched first for `meshes`, which are read if that is set. If there are more than `most` faces,
+    Mesh files are read if `meshes` is true and are first searched in `folders`. If there are more than `most` faces,
     nearby corners are merged.
     """
     missing: dict[str, str] = {}
@@ -113,7 +113,7 @@ def _triangulate(
     missing: dict[str, str],
     default: tuple[float, ...] = SURFACE_STYLE.grey,
 ) -> list[Triangles]:
-    """Convert the shapes of a link to coloured triangles in its frame; record missing meshes in `missing`."""
+    """Convert the shapes of a link to coloured triangles in the link's frame; record missing meshes in `missing`."""
     triangles = []
     for shape in shapes:
         if shape.kind == "mesh" and not meshes:

@@ -53,7 +53,7 @@ class Buffers:
 
 
 class Page(NamedTuple):
-    """A web page that plays a motion: its HTML, and the meshes that are not shown with the reasons."""
+    """A web page that plays a motion: its HTML, and by file the reasons why meshes are not shown."""
 
     text: str
     missing: dict[str, str]
@@ -67,10 +67,10 @@ def build_page(
     meshes: bool = True,
     workpiece: tuple[Array, NDArray[np.intp]] | None = None,
 ) -> Page:
-    """Return the page that plays one motion, or a motion and others to compare it with.
+    """Return the page that plays one motion, or several motions for comparison.
 
-    `folders` are searched first for `meshes`; without meshes collision shapes are shown. `workpiece` has vertices (k,
-    3) in world, m, and triangles (f, 3) of a body that is shown as well.
+    `folders` are searched first for meshes; if `meshes` is false, collision shapes are shown. `workpiece` is another
+    body to show: vertices (k, 3) in world, m, and triangles (f, 3).
 
     Raises:
         ProblemError: There is no motion, or the page is too large.
@@ -161,7 +161,7 @@ def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: 
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Return the poses of k frames as positions and quaternions, with signs continuous in time. Shape (M, k, 7)."""
+    """Return the poses of k frames: positions, and quaternions with signs that do not jump in time. Shape (M, k, 7)."""
     poses = []
     for name in names:
         quaternions = align_signs(quaternion_from_rotation(frames.rotations[name]))
@@ -245,7 +245,7 @@ def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[s
 
 
 def _plain(value: float | None) -> float | None:
-    """Return a number for JSON, or None if the number is not finite."""
+    """Return a number as a JSON value: None if the number is None or not finite."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
@@ -258,7 +258,7 @@ class PageServer:
     """Context manager that serves one page by HTTP at `address` to browsers on this machine."""
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port."""
+        """Prepare to serve the HTML text of a page on the first free port from `port` on; 0 selects any free port."""
         self._server = _start_server(text.encode(), port)
         self.address = f"http://{HOST}:{self._server.server_address[1]}"
         self._thread = Thread(target=self._server.serve_forever, name="page", daemon=True)

@@ -268,7 +268,7 @@ def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
 
 
 def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
-    """Return lower and upper bounds (2, n) and units of states and controls by name; {} if there is no problem."""
+    """Return lower and upper bounds (2, n) and units of states and controls by name; {} if the problem is unknown."""
     if solution.problem is None:
         return {}, {}
     form = Formulation.of(solution.problem)

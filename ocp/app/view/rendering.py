@@ -92,7 +92,7 @@ class Camera(NamedTuple):
     def around(
         cls, points: Any, size: tuple[int, int], elevation: float = 22.0, azimuth: float = -58.0, *, room: float = 0.04
     ) -> Camera:
-        """Return the camera nearest to points (k, 3), m, that sees them all in a given direction (angles in degrees).
+        """Return the nearest camera that sees all given points (k, 3), m, in a given direction (angles in degrees).
 
         Each edge of the picture is a plane through the eye with all points on its inner side, which gives the position
         in closed form. `room` is the margin at every edge, relative to the picture.
@@ -378,7 +378,7 @@ class _Sun:
 def _draw_floor(
     picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None, bare: NDArray[np.intp]
 ) -> None:
-    """Draw the floor and the shadows on it at those samples of a picture, `bare`, that no surface covers."""
+    """Draw the floor and its shadows at the samples `bare` of a picture, where no surface is visible."""
     ray, eye = camera.rays(bare), camera.eye.astype(np.float32)
     depth = np.float32(floor.height - camera.eye[2]) / ray[:, 2]
     x, y = (eye[k] + depth * ray[:, k] for k in range(2))

@@ -239,7 +239,7 @@ def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_r
 
 
 def curve_samples(motion: Motion, kind: str) -> tuple[Array, Array | None]:
-    """Return times (K,), s, at which to draw a quantity of a motion, and its values (K, n); None if it is unknown."""
+    """Return times (K,), s, at which to draw a quantity of a motion, and the values (K, n) or None if unknown."""
     own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
     times = np.union1d(np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times)
     quantity = motion.quantity(kind)
@@ -263,7 +263,7 @@ def draw_curves(
     parts = []
 
     def place_of(time: Any) -> Any:
-        """Return the horizontal position of a time (s) or of several in a diagram, px."""
+        """Return the horizontal positions of one or several times (s) in a diagram, px."""
         return width * (time - motion.t[0]) / (motion.t[-1] - motion.t[0])
 
     for column, (kind, per) in enumerate(KINDS.items()):

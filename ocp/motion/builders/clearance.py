@@ -215,7 +215,7 @@ def solve_with_clearance(
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a name, with or without the name of a phase in front, is that of a clearance constraint."""
+    """Return whether a name, which may begin with the name of a phase, is the name of a clearance constraint."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 

@@ -167,9 +167,9 @@ class ConstantJerkMotion:
 def path_solution(
     problem: Problem, method: str, curves: tuple[PiecewisePolynomial, ...], *, horizon: float, cost: float, message: str
 ) -> Solution:
-    """Return curves of states, controls and costates, which no solver computed, as a solution of a problem.
+    """Return curves of states, controls and costates that no solver computed as a `Solution` of a problem.
 
-    `message` says why its optimality is open; it is empty if the motion is optimal.
+    `message` says why it is unknown whether the motion is optimal, and is empty if the motion is optimal.
     """
     form = Formulation.of(problem)
     columns = {name: slice(*entries.indices(form.nx)) for name, entries in form.states.items()}
@@ -301,7 +301,7 @@ def segment_durations(changes: Array, bounds: JointBounds) -> Array:
 
 
 def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk limits of joints; missing limits become finite where profiles need it."""
+    """Return velocity, acceleration and jerk limits; joints without the last two limits get finite ones."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -311,7 +311,7 @@ def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array,
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest profiles of K straight motions over joint displacements (K, n), as fractions of these."""
+    """Return the fastest profiles of K straight motions over displacements (K, n), as fractions of the displacement."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -426,7 +426,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scale factors (4, n) of angles, speeds, accelerations, jerks of reaction wheels, nan for other joints."""
+    """Return scales (4, n) of angles, speeds, accelerations and jerks of reaction wheels; nan for other joints."""
     # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():

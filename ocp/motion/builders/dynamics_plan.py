@@ -215,7 +215,7 @@ class SolveSettings:
         return {**IPOPT, **(self.options or {})}
 
     def options_from(self, problem: Problem, mesh: Collocation, guess: Guess) -> dict[str, Any]:
-        """Return the IPOPT options for a guess; those that the user gives come before those that suit the guess."""
+        """Return the IPOPT options for a guess; options given by the user override those that suit the guess."""
         suitable = WARM_START_OPTIONS if isinstance(guess, Solution) else {}
         return {**barrier_options(problem, mesh, self.guess_cost, suitable), **self.ipopt_options}
 
@@ -290,7 +290,7 @@ def within_limits(
 
 
 def _first_within_limits(problem: Problem, mesh: Collocation, settings: SolveSettings, begin: Guess) -> Solution:
-    """Return the first plan on finer and finer meshes that passes its audit, or else the feasible one of least cost;
+    """Return the first plan on finer and finer meshes that passes its audit, or else the feasible plan of least cost;
     raise SolveError if there is none, or if a plan fails only because of collisions.
     """
     reasons: list[str] = []

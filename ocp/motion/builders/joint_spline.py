@@ -384,7 +384,7 @@ class _BatchedFunction:
         self.tables[width].append((table, steps))
 
     def _allocate(self, width: int) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Allocate a work array, a row for each value in the Function; return it and the instructions on its rows."""
+        """Return a new work array, with one row for each value in the Function, and the instructions on these rows."""
         table = np.zeros((self.rows + len(self.constants), width))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)

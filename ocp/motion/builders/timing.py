@@ -233,7 +233,7 @@ def _declare(
     along: Any,
 ) -> Problem:
     """Declare the minimum-time problem, with the time of the reference motion as independent variable, in scaled units.
-    `along` returns the reference speed and the `path_columns` at such a time.
+    `along` returns the reference speed and the `path_columns` at a time of this motion.
     """
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
@@ -398,7 +398,7 @@ def _bernstein(x: Array) -> Array:
 
 
 def distinct(values: Array, tolerance: float) -> Array:
-    """Sort values and drop each value that exceeds the one before by at most a tolerance; the largest one is kept."""
+    """Sort values; drop each value that exceeds the value before by at most a tolerance, but keep the largest value."""
     ordered = np.sort(values)
     ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
     ordered[-1] = values.max()

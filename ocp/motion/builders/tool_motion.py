@@ -151,8 +151,8 @@ class ToolMotionSetup:
 
     `relaxed` tasks may deviate, J u - b = relaxation S, by the control S, ERRORS, at the cost |S|^2 / 2. The
     constraints then stay independent where the rows of J depend on each other. If a motion of cost c does the tasks
-    within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Only with the tasks' own time and
-    without actuator limits.
+    within the limits, the optimum deviates by less than relaxation sqrt(2 c horizon). Tasks can be relaxed only in
+    their own time and without actuator limits.
     """
 
     base: Array  # configuration of the base at the start, (base_size,)
@@ -272,7 +272,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     """Declare states, controls and constraints in one time interval of fixed duration with the same active tasks.
 
     Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that this
-    stretch fixes at its end (see `_pose_jacobian`); `known` is that of the stretch before, or None.
+    stretch fixes at its end (see `_pose_jacobian`); `known` is this Jacobian for the stretch before, or None.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]

@@ -200,7 +200,7 @@ class Chain:
         return positions, rotations.reshape(-1, 3, 3)
 
     def random_configurations(self, count: int, seed: int) -> tuple[Array, Motion]:
-        """Return random joint positions (count, n), up to pi rad or, if prismatic, the arm's size, and tip poses."""
+        """Return random configurations (count, n) and tip poses; joints are within +-pi rad or +- the arm's size, m."""
         joints = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, len(self.axes)))
         joints[:, ~self.revolute] *= self.size / np.pi
         positions, rotations = self.poses(joints)

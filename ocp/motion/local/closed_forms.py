@@ -71,15 +71,15 @@ class PoseSolver(ABC):
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return the IK solutions at M poses of the tip; at singular poses some solutions may be missing.
 
-        `redundant` has the positions of the redundant joints, (M, k). Return also masks (M,) of the poses where it must
-        be confirmed that these are all, and of those where some may be missing.
+        `redundant` has the positions of the redundant joints, (M, k). Return also two masks (M,): poses at which it
+        must be confirmed that these are all solutions, and poses at which some may be missing.
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
         """Return all isolated IK solutions at M poses, and a mask (M,) of poses where some solutions may be missing.
 
-        Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
-        continuously on the pose, and of a family some members are found.
+        Where solutions may be missing, and at singularities, solutions at nearby poses are candidates too: isolated
+        solutions depend continuously on the pose, and some members of a family are found.
         """
         tips, count = Motion(rotations, positions), len(positions)
         solutions, unconfirmed, doubtful = self.solve_regular(tips, redundant)
@@ -132,7 +132,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the closed loop of joint axes from base to tip and back, with intersecting or parallel axes last."""
+        """Return the loop of joint axes that the tip pose closes, with the three joints of `triple` last."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -151,7 +151,7 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Stack the joint positions of IK solutions in one column; `order` has the joint indices of their entries."""
+        """Stack the joint positions of IK solutions in a column; `order` lists the joints as ordered in a solution."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
@@ -193,7 +193,7 @@ class ClosedForm(PoseSolver):
     @cached_property
     def _triple_function(self) -> Sampler:
         """Function from a tip pose and angles of the first and third joint in the loop closure equation to two IK
-        solutions, the fraction by which the reach of the last three joints is exceeded, and the second's lever arm.
+        solutions, the fraction by which the last three joints' reach is exceeded, and the second joint's lever arm.
         """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
@@ -276,8 +276,8 @@ def _pair_solver() -> Any:
 
     The singular value decomposition b = L diag(s) R, in closed form, separates the angles: with a' = L' a and c' = L' c
     the remainders w = c' - a' [cos, sin](first) satisfy (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1, a trigonometric polynomial
-    of two harmonics. The outputs are sixteen first and second angles, some of which do not hold; how far each pair is
-    from a solution; and a number that vanishes where an angle is not determined.
+    of two harmonics. The outputs are sixteen pairs of angles, some of which are no solutions; how far each pair is from
+    a solution; and a number that vanishes where an angle is not determined.
     """
     a, b, c = ca.SX.sym("a", 2, 2), ca.SX.sym("b", 2, 2), ca.SX.sym("c", 2)
     mean, difference = (b[0, 0] + b[1, 1]) / 2, (b[0, 0] - b[1, 1]) / 2
@@ -317,8 +317,8 @@ def _pair_solver() -> Any:
 def _close_roots(f: Harmonics) -> Any:
     """Return eight angles (8, 1) that include all roots of a trigonometric polynomial; double roots become close pairs.
 
-    Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
-    curvature there has both.
+    Of two roots close to each other the general method may find only one. The parabola with the same value, slope and
+    curvature there has both roots.
     """
     size = TINY + sum(map(ca.fabs, f))
     f = Harmonics(*(part / size for part in f))
@@ -334,14 +334,14 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the mean and half the difference of the two roots q, or best q, of a cos(q) + b sin(q) = value."""
+    """Return mean and half difference of the roots q of a cos(q) + b sin(q) = value; of the best q if none exist."""
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
     """Return two solutions for three joints that must produce a rotation (meeting axes) or a planar motion (parallel
-    axes), and the fraction by which the motion exceeds their reach; the solutions are then the nearest.
+    axes), and the fraction by which the motion exceeds their reach. Beyond the reach, the solutions are the nearest.
     """
     a, b, c = axes
     goal_point = goal.point(c.point)

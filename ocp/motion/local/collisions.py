@@ -180,7 +180,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 def worst_collisions(
     scene: CollisionScene, base: Array, joints: Array, times: Array, *, pairs: Sequence[int] | None = None
 ) -> list[Collision | None]:
-    """Return for each sample the closest pair of bodies that violates the clearance by more than rounding, or None."""
+    """Return for each sample the closest bodies that violate the clearance by more than rounding errors, or None."""
     distances = distances_along(scene, base, joints, times, cutoff=scene.clearance, pairs=pairs)
     worst = list[Collision | None]([None] * len(joints))
     for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance - STANDSTILL).tolist():
@@ -259,8 +259,8 @@ def slide_apart(
 ) -> Array:
     """Move configurations (K, n) out of collision along their self-motion manifolds, as far as necessary or possible.
 
-    Return for each the one on its path with the largest minimum distance. `jacobian` gives the Jacobian (m, n) of the
-    task at a configuration (n,), and `back` moves configurations to nearby ones that satisfy the task again.
+    Return the configurations on these paths with the largest minimum distances. `jacobian` gives the Jacobian (m, n) of
+    the task at a configuration (n,), and `back` moves configurations to nearby ones that satisfy the task again.
     """
     count, n = joints.shape
     target = scene.clearance + SLIDING.spare

@@ -121,9 +121,9 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]  # openings of the loop that have regular problems, the best first
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses, and masks of poses where completeness is to be confirmed, or doubtful.
+        """Return IK solutions at M poses, and two masks: poses to confirm, and poses where solutions may be missing.
 
-        Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
+        Solutions may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions; completeness is then
         to be confirmed. Such poses are solved with further openings.
         """
@@ -171,8 +171,8 @@ class Elimination(PoseSolver):
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
     """Return the elimination solver of six joints of a chain; None if all eigenvalue problems are singular.
 
-    At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
-    find the most of these configurations again, and the most solutions.
+    At random configurations the openings are sorted by the condition of their problems. The first openings that recover
+    the most of these configurations, and find the most solutions, are taken.
     """
     joints, tips = chain.random_configurations(ELIMINATION.trials, ELIMINATION.seed)
     solver = Elimination(chain, redundant, ())
@@ -227,7 +227,7 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coefficients of 1, cos and sin of joint angles in 15 coordinates of a point and direction they move.
+    """Return the coefficients of 1, cos and sin of joint angles in 15 coordinates of a moved point and direction.
 
     The module's docstring defines the coordinates. Shape (M, 15, 3, ...). `axes` begins with the joint that moves the
     point first; the array has the axes of the joint angles in reverse order.

@@ -198,8 +198,8 @@ class IkSolver:
 
         Args:
             positions: Positions in the world. Shape (3,) or (N, 3), m.
-            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3). Of what is open their value does not matter: with a
-                free roll they give the direction of the tool axis.
+            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3). Only the part that the task
+                prescribes matters: with a free roll, the direction of the tool axis.
 
         Raises:
             ProblemError: A shape is wrong, a value is not finite, or a matrix is not a rotation.
@@ -293,7 +293,7 @@ class ArmSolver:
         return joints, pose, tuple(reasons)
 
     def _of_the_arm(self, solver: PoseSolver, solutions: Solutions, goal: Motion) -> Solutions:
-        """Return a solver's solutions for the joints of the arm alone, without those that then become duplicates."""
+        """Drop auxiliary joints from a solver's solutions; return the distinct solutions for the arm's own joints."""
         n, extended = len(self.chain.axes), solver.chain
         if self.auxiliary:
             still = (np.abs(solutions.joints[:, list(self.auxiliary)]) < ARM.auxiliary).all(axis=1)
@@ -347,7 +347,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tuple[int, ...]]:
-    """Return the pose solvers of an arm whose tip may rotate about `axes` (k, 3), and the added joints kept at zero."""
+    """Return the pose solvers of an arm whose tip may rotate about `axes` (k, 3), and auxiliary joints kept at 0."""
     extended = chain.extend(axes, np.tile(chain.position, (len(axes), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):

@@ -130,7 +130,7 @@ def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointB
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
-    """Return the most exceeded limit of joints whose motion the tasks determine; None if they exceed none.
+    """Return the most exceeded limit of joints whose motion the tasks determine; None if no limit is exceeded.
 
     The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
     moves at a random configuration is not moved at almost all configurations: the tasks determine its motion. Divided
@@ -235,8 +235,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 def _smoothing(unlimited: SolvedPlan, mesh: Collocation, cost: float, has_jerks: bool) -> float:
     """Return the duration, as a share of the horizon, in which a control passes from limit to limit.
 
-    It is the default unless the term of the cost that this duration stands for (see `declare_actuators`) then exceeds
-    the error that a cost may have, for the motion without actuator limits, which costs `cost`.
+    It is the default unless the term of the cost that depends on this duration (see `declare_actuators`) is then larger
+    than the permitted error of `cost`, the cost of the motion without actuator limits.
     """
     fractions, squares = _guess_fractions(mesh), 0.0
     for part in unlimited.parts:
@@ -261,8 +261,8 @@ def _guess_fractions(mesh: Collocation) -> Array:
 
 
 def _slopes(values: Array, times: Array) -> Array:
-    """Return time derivatives of the samples (N M, n) of N intervals, by differences inside the intervals. `times` has
-    the shape (N, M). Same shape as the values.
+    """Return the time derivatives (N M, n) of samples (N M, n) in N intervals, by differences inside the intervals.
+    `times` has the shape (N, M).
     """
     slopes = np.gradient(values.reshape(*times.shape, -1), GUESS_PLACES, axis=1)
     return np.asarray(slopes / np.gradient(times, GUESS_PLACES, axis=1)[:, :, None]).reshape(values.shape)

@@ -123,7 +123,7 @@ class CandidateQueue:
         """Advance the candidates of a batch until none of them can cost less than the best candidate that passed.
 
         Initial guesses that differ by full turns of joints lead to motions that differ by the same turns, unless joint
-        limits intervene: only the first of them is solved then.
+        limits intervene: then only the first of these motions is solved.
 
         Args:
             seeds: Candidates in the order in which they are solved from their initial guesses.

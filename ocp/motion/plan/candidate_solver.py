@@ -172,7 +172,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Solve again with separation constraints if bodies collide; otherwise refine the mesh of the motion."""
+        """Solve a candidate again with separation constraints if bodies collide; otherwise refine its mesh."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -235,7 +235,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a candidate whose guess is an audited motion with a fixed start, but whose start is free; else []."""
+        """Return a list of one candidate with free start if the given one passed with a fixed start; else []."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -295,7 +295,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the start configuration, nan for free joints; those that move bodies to be separated are free."""
+        """Return the start configuration, with nan for joints that are free or move a separated pair of bodies."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -306,7 +306,7 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return solver options, with which separation constraints leave a guess in its homotopy class."""
+        """Return solver options; with separation constraints, they keep the homotopy class of the guess."""
         declared, least = motion.problem.declared, self.settings.negligible_rate * motion.horizon
         if not any(name.startswith(APART) for name in declared.path) or not least < cost < np.inf:
             return dict(options)

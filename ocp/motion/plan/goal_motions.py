@@ -57,7 +57,7 @@ class GoalSettings:
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
         spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least time of a
             motion that stops at corners.
-        longest: Largest horizon in free time, and inverse of the least one, relative to the same.
+        longest: Largest ratio of a free horizon to its guess, and inverse of the smallest ratio.
         guess_times: Number of time samples of a guess.
         near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
         phase_samples: Number of samples of each phase of a motion at which its clearance is checked before the audit.
@@ -118,7 +118,7 @@ class GoalRequest:
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
-        """Return a context manager that limits the seconds of wall time, or of processor time without a time limit."""
+        """Limit a ``with`` block to `seconds`: of wall time if the request has a time limit, else of processor time."""
         return time_limited(seconds, processor=self.time_limit is None)
 
 
@@ -189,9 +189,9 @@ def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
-    """Return the fastest motion that ignores obstacles, audited, if it is collision-free; else an empty list.
+    """Return a list of the audited fastest motion that ignores obstacles, or an empty list if this motion collides.
 
-    No motion is faster unless torques slow it down.
+    No other motion is faster unless torque limits slow down this motion.
     """
     durations = least_durations(np.abs(task.goals - task.start), task.bounds).max(axis=1)
     for goal in np.argsort(durations, kind="stable").tolist():

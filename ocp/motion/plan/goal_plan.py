@@ -185,8 +185,8 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
 def _find_paths(task: GoalTask, seconds: float) -> Iterator[JointPath]:
     """Yield collision-free paths, or raise SolveError if there is none.
 
-    They have several homotopy classes and locally shortest length, and the shortest is the first. Where only the time
-    of the motion counts, they are neither optimised nor sorted.
+    The paths are locally shortest in several homotopy classes, and the shortest of them is the first. Where only the
+    time of the motion counts, they are neither optimised nor sorted.
     """
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)

@@ -111,8 +111,8 @@ def plan_from_configurations(
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     """Return the plan of the candidate that costs least in terms of the cost function of the request.
 
-    If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
-    their costs before. If no motion passed, raise SolveError.
+    If this function is not the integral of the squared rates, all motions that passed are solved again for this
+    function, in the order of their previous costs. If no motion passed, raise SolveError.
     """
     if (cost := solver.request.cost) is None or not queue.passed:
         return queue.plan()
@@ -126,9 +126,9 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates with local (resolved-rate) motions as guesses, those that satisfy the tasks first, by cost.
+    """Return candidates with local (resolved-rate) motions as guesses, by cost; motions that miss the tasks come last.
 
-    The cost includes that of the approach from the configuration `near` of the request.
+    The cost includes the cost of the approach from the configuration `near` of the request.
 
     Args:
         motions: K local motions through each time interval.
@@ -214,7 +214,7 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
 
 def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
-    """Solve candidates from a global search; return whether one has passed and no other one promises to cost less.
+    """Solve candidates from a global search; return whether one has passed and no other promises to cost less.
 
     Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
     free start and, at last, with relaxed tasks.
@@ -278,7 +278,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     """Solve candidates again: with separation constraints on colliding bodies, or from fixed collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
-    motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
+    motions belong to different homotopy classes; motions without or with the least collision come first. A free start
     is also displaced by every separation later on the path. A fixed one leads to a motion closer to its guess.
     """
     request, max_tries = solver.request, solver.settings.max_failures

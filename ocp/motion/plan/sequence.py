@@ -113,7 +113,7 @@ class _Sequence:
 
     @property
     def smooth(self) -> bool:
-        """Whether joint rates must be continuous, because actuators are limited or weighted."""
+        """Whether joint rates must be continuous, because actuator quantities are limited or contribute to the cost."""
         limits, cost = self.options.limits or Limits(), self.options.cost
         return limits_actuators(limits) or (cost is not None and weights_actuators(cost))
 
@@ -168,7 +168,7 @@ class _Sequence:
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
         """Return the motion along tasks from the configuration `near` or, if the tasks start elsewhere, from any start.
 
-        Among start configurations, those count as better to which the motion from `near` costs less.
+        A start configuration counts as better than another if the motion from `near` to it costs less.
         """
         machine, start = self.machine, None
         if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
@@ -184,7 +184,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _with_approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append an approach to the start of a task to the sequence, if needed; return the plan along the task."""
+        """Add an approach motion to the sequence if the start of a task requires it; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -224,7 +224,7 @@ def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the joint positions at the start of the next task's plan, unchanged if they miss the goal."""
+    """Return a goal with the joint positions at the start of the next task's plan, or the old goal if these miss it."""
     first = plan.at(0.0)
     if goal.region is not None or (
         goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START

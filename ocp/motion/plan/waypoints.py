@@ -180,7 +180,7 @@ class _WaypointPlanner:
         self._section_joints = tuple(robot.joint_names.index(name) for name in nearest)
 
     def plan(self, counted: bool) -> PathPlan:
-        """Plan the lowest-cost path through all waypoints, in one segment or, if `counted`, in the fewest segments.
+        """Plan the lowest-cost path through all waypoints, in the fewest segments if `counted`, otherwise in one.
 
         Some waypoints are searched, and the paths found are extended to all waypoints. If that fails, the waypoints
         where it fails, or more closely spaced ones, are searched as well.
@@ -401,7 +401,7 @@ class _WaypointPlanner:
         return joints
 
     def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """Describe a requirement that a path violates ("" if none); also return the waypoints of the violations."""
+        """Return a text about a requirement that a path violates, "" if none, and the indices of invalid waypoints."""
         names, indices = self.machine.robot.joint_names, np.arange(len(joints))
         errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
         excess = np.maximum(joints - self.upper, self.lower - joints)

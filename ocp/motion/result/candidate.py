@@ -152,10 +152,10 @@ class Candidate:
         start: Start configuration of the search, rad or m. Shape (n,).
         cost: Cost of the motion, nan if none was found. Until it is solved on the fine mesh, it is an estimate, which
             further constraints can only increase.
-        reason: Why it is not the plan; None for the plan.
-        stage: Stage that it has reached.
-        solution: Solution of the last solve; of a finished candidate only if that was on the fine mesh.
-        seed: Guess from which it started.
+        reason: Reason why the candidate is not the plan; None for the plan.
+        stage: Stage of the solution process that the candidate has reached.
+        solution: Solution of the last solve; None for a finished candidate that was not solved on the fine mesh.
+        seed: Initial guess of the candidate.
         constraints: Clearance constraints with the separated pairs.
         separations: Number of solves that separated pairs, or separated them farther.
         separated: Reason of the last separation.
@@ -199,7 +199,7 @@ class Candidate:
 
     @property
     def total(self) -> float:
-        """Cost by which candidates are compared: that of the motion and of the approach to its start."""
+        """Cost for comparing candidates: the cost of the motion plus the cost of the approach to its start."""
         return self.cost + self.seed.approach
 
     @property
@@ -208,7 +208,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected for `reason` or, if a separation was tried, for the collision before it."""
+        """Return a copy rejected for `reason` or, if colliding bodies were separated in vain, for their collision."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
@@ -220,7 +220,7 @@ class Candidate:
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return finished candidates, the lowest-cost one that passed first, then by rising cost.
+    """Return finished candidates: first the lowest-cost candidate that passed, then the others by rising cost.
 
     Other candidates that passed are rejected, because they cost more.
     """
@@ -323,7 +323,7 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
 
 
 def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return the reason for rejecting a motion that misses its tasks: a rate beyond its limit, or the largest error.
+    """Return why a motion that misses its tasks is rejected: a rate beyond its limit, or else the largest pose error.
 
     The largest pose error is described together with a joint that is at its limit at that time.
     """

@@ -93,7 +93,7 @@ class Requirements(NamedTuple):
 
 
 class Range(NamedTuple):
-    """Largest allowed size of one uncertainty, or common factor of several sizes, and the limit that it reaches first.
+    """Largest allowed size of an uncertainty, or factor of several sizes, and the limit that prevents a larger value.
 
     Attributes:
         size: Largest size (kg, share of the torque limits, or m), or factor.
@@ -117,10 +117,10 @@ class Margin:
 
     Attributes:
         alone: Largest size of each uncertainty if the others are zero.
-        together: Sizes of all uncertainties within which any combination, in any directions, keeps all limits. They
-            grow in proportion: one that reaches a limit stops, the others go on. The stated sizes grow first, up to
-            themselves if others are not stated; these share the rest in proportion to their sizes alone.
-        factor: Factor by which all stated sizes, or all sizes alone if none is stated, may be multiplied at once.
+        together: Sizes of all uncertainties within which any combination, in any directions, keeps all limits. The
+            sizes grow in proportion until limits stop them: first the stated uncertainties, up to their stated sizes
+            if others are not stated; then the others, in proportion to their sizes in `alone`.
+        factor: Factor by which all stated sizes, or all of `alone` if none is stated, may be multiplied at once.
         stated: Stated sizes.
         moves_tip: Whether the tip may deviate by as much as base or tool, because no tolerance limits its deviation.
     """
@@ -374,7 +374,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     def add(
         name: str, most: float, value: Array, change: Array, friction: Array | None = None, joint: str = ""
     ) -> None:
-        """Require `value` <= `most`; `change` and `friction` are its growth per unit of payload and friction error."""
+        """Require `value` <= `most`; it grows by `change` per unit of payload, by `friction` per unit of friction."""
         if np.isfinite(most):
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})

@@ -76,7 +76,7 @@ class PathPlan(Plan):
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """Solution of an optimal control problem, which a path through waypoints does not have.
+        """Solution of an optimal control problem; not available, since a path through waypoints solves none.
 
         Raises:
             ProblemError: Always.
@@ -282,7 +282,7 @@ def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
 def _largest(
     name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
 ) -> Finding:
-    """Return the audit finding about the largest of the values, whose first axis is time; below zero counts as 0."""
+    """Return the audit finding about the largest of the values, whose first axis is time; 0 if all are negative."""
     if not values.size:
         return Finding(name, 0.0, limit, unit=unit)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

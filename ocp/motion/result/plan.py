@@ -172,10 +172,10 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solved optimal control problems of the plan, each with those of the times (M,), s, that lie in it.
+        """Return each solution in the plan with the suffix of its variable names and the given times that lie in it.
 
-        Each comes with the suffix of the names of its states and with its times, shape (K,), s; all K add up to
-        M. The list is empty for a plan that solves no optimal control problem.
+        The times (M,), s, are divided among the solutions: each gets an array (K,) on its own clock, and all K add up
+        to M. The list is empty for a plan that solves no optimal control problem.
         """
 
     # ---- audit -------------------------------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ class Plan(ABC):
 
     @property
     def joint_bounds(self) -> JointBounds:
-        """Limits of all joints during the plan: the tighter ones of the robot's and of those stated to the planner."""
+        """Limits of all joints during the plan: the tighter of the robot's limits and those stated to the planner."""
         return Limits().bounds(self.machine)
 
     def limit_findings(self) -> list[Finding]:

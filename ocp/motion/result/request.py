@@ -113,7 +113,7 @@ class MotionRequest:
 
     @property
     def cost(self) -> Any:
-        """Cost function with which the problem is declared, or None for that of its builder."""
+        """Cost function with which the problem is declared; None stands for the default of the builder."""
         return getattr(self.arguments.get("actuation"), "cost", self.arguments.get("cost"))
 
     def __repr__(self) -> str:

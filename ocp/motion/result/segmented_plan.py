@@ -103,7 +103,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Sum of the lower bounds of the consecutive plans, whose ends count as fixed; None if a bound is unknown."""
+        """Sum of the lower bounds of the consecutive plans, each for its fixed ends; None if a bound is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
@@ -154,7 +154,7 @@ class ConsecutivePlans(Plan):
         return evaluate_parts([piece.begin for piece in pieces], times, size, values)
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solved problems of all plans, each with those of the times (M,), s, that lie in it."""
+        """Return each solution with the suffix of its variable names and the given times that lie in it."""
         pieces = self.pieces
         which = segment_index([*(piece.begin for piece in pieces), np.inf], times)
         parts: list[tuple[Solution, str, Array]] = []

@@ -43,7 +43,7 @@ class Part(NamedTuple):
 
 
 def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
-    """Return the part of the cost of a solution by which relaxed tasks limit the deviations from their targets."""
+    """Return the part of a solution's cost that penalises deviations of relaxed tasks from their targets."""
     breaks = solution.control_interpolant.breaks
     points, weights = np.polynomial.legendre.leggauss(len(solution.control_interpolant.nodes))
     widths = np.diff(breaks)
@@ -118,7 +118,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._evaluate(times, size, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return for each part its solution, the suffix of variable names, and the given times on its own clock."""
+        """Return for each part the solution, its suffix of variable names, and its times on the solution's clock."""
         which = segment_index([*self._begins, np.inf], times)
         return [
             (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)

@@ -238,7 +238,7 @@ def shorten(motions: StraightMotions, path: Array, scale: Array, *, random: np.r
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array) -> bool:
-    """Return whether two paths count as homotopic: straight motions between equal fractions of them are collision-free.
+    """Return whether two paths count as homotopic: no straight motion between their points at equal fractions collides.
 
     Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses.
     """
@@ -423,7 +423,7 @@ def _length_step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point z of the polyhedron `rows` z >= `least`, which contains the origin, nearest to a target."""
+    """Return the point nearest to a target in the polyhedron `rows` z >= `least`, which contains the origin."""
     needed = least - rows @ target
     if needed.max(initial=0.0) <= 0:
         return target

@@ -48,7 +48,7 @@ from ocp.motion.tasks.limits import JointBounds
 
 @dataclass(frozen=True)
 class SplineMotionSettings:
-    """Settings of `optimal_motion_near`: of the spline, the constraints, the trust region and the iterations.
+    """Settings of `optimal_motion_near` for its spline, constraints, trust region and iterations.
 
     Attributes:
         intervals: Number of intervals of the spline between the short ones at both ends.
@@ -284,7 +284,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if self.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return p, L: the integral of a squared derivative is |L c|^2 / T^p (c: control points, T: duration)."""
+        """Return p, L such that |L c|^2 / T^p is an integrated squared derivative (control points c, duration T)."""
         places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
@@ -428,7 +428,7 @@ class _Search:
         return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _Step | None:
-        """Return a step, by a linear or quadratic program in a trust region; None if that has no solution."""
+        """Return a step, computed by a linear or quadratic program in a trust region; None if the program fails."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]

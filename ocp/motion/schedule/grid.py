@@ -105,7 +105,7 @@ class Grid:
 
     @cached_property
     def rows(self) -> Rows:
-        """Coefficients of all limits at all nodes, followed by those just before the nodes where path segments meet."""
+        """Coefficients of all limits at all nodes, then also just before each node where path segments meet."""
         return limit_rows(self.path, self.limits, self.joints, np.concatenate([self.distance, self.before]))
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
@@ -126,7 +126,7 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def split(self, first: int, parts: NDArray[np.intp]) -> Grid:
-        """Return the grid of N intervals that begin at a node, each split into a given number of equal parts (N,)."""
+        """Return the grid of the N intervals after a node, each split into a given number of equal parts (N,)."""
         last, ends = first + len(parts), np.append(0, np.cumsum(parts))
         s = np.interp(np.arange(ends[-1] + 1), ends, self.distance[first : last + 1])
         own = (self.jumps > first) & (self.jumps <= last)
@@ -256,7 +256,7 @@ def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
 
 
 def _separate(places: Array, nodes: Array) -> Array:
-    """Sort positions on a path and remove those too close to another position; positions in `nodes` are kept."""
+    """Sort positions on a path, and remove positions that are too close to another one unless they are in `nodes`."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
@@ -315,7 +315,7 @@ def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple
 
 
 def limit_slope(values: Array, gain: Array) -> Array:
-    """Lower values (N,) as little as possible so that neighbours differ by at most as much as those of `gain`."""
+    """Lower values (N,) as little as possible so that no difference between neighbours exceeds that of `gain`."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
 

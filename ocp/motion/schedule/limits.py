@@ -104,7 +104,7 @@ class JointLimits:
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """Limits of the tool: acceleration, jerk and velocity (m/s^2, m/s^3, m/s) along each world axis; angular speed.
+    """Limits of the tool: angular speed, and acceleration, jerk and velocity along each world axis, in SI units.
 
     Attributes:
         acceleration, jerk, velocity: Symmetric limits. Shape (3,), or one number for all axes.
@@ -160,9 +160,9 @@ class LineLimits:
                 require.instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Return velocity, acceleration and jerk limits of `count` joints, infinite for limits of 0. Shape (3, count).
+        """Return velocity, acceleration and jerk limits of `count` joints; 0 is replaced by infinity. Shape (3, count).
 
-        Joints with a limit of 0 do not move, see `check_line`.
+        A joint with a limit of 0 does not move, so that its limits have no effect; see `check_line`.
         """
         values = self._of_joints(count, ("velocity", "acceleration", "jerk"))
         return np.where(values == 0, np.inf, values)

@@ -86,7 +86,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return G distances, the speeds of the maximum velocity curve there, and G - 1 requested speeds between."""
+    """Return G distances, the maximum velocity curve at these, and the requested speeds (G - 1,) between neighbours."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -131,9 +131,9 @@ def _refine_distances(
 def _unresolved_intervals(
     length: float, s: Array, permitted: Array, requested: Array, acceleration: float
 ) -> NDArray[np.bool_]:
-    """Return which intervals of the maximum velocity curve are too long where the curve limits the motion.
+    """Return which intervals are too long to resolve the maximum velocity curve where it limits the motion.
 
-    It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
+    The curve does so where it is near or below the requested speed and the acceleration suffices to get near it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
     reachable = limit_slope(permitted**2, 2 * acceleration * (s - s[0]))
@@ -301,9 +301,9 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return a speed profile within all limits: that of `line_profile`, planned again where limits are violated.
+    """Return a speed profile within all limits: `line_profile`, planned again where it violates a limit.
 
-    If it is None, the whole path is planned.
+    If `line_profile` is None, the whole path is planned.
     """
     count = len(grid.requested)
     if line_profile is None:
@@ -362,9 +362,9 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 def _violated_stretches(
     grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float
 ) -> list[tuple[int, int]]:
-    """Return first and last node of each part of a path that must be planned again, as a limit is violated in it.
+    """Return the first and last node of each part of a path that must be planned again because it violates a limit.
 
-    They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
+    The parts end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
     rest.
     """
     count, s, limits = len(violated), grid.distance, grid.limits
@@ -390,7 +390,7 @@ def _violated_stretches(
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near those of its ends that are not ends of the whole path."""
+    """Return whether a motion has the requested speed near its ends, except at the ends of the whole path."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):

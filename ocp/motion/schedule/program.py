@@ -94,11 +94,11 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients.
+    """Spline of the squared speed over the distance along a path, with N + 1 nodes (m) and N + 2 coefficients.
 
-    In an interval the acceleration is linear in the time of a motion whose speed is linear in time, from `ratios` times
-    its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With ratios of 1 this
-    is a spline of degree 2. The coefficients are the values where the tangents at neighbouring nodes meet.
+    In each interval the acceleration is linear in the time of a motion whose speed v is linear in time and starts at
+    `ratios` times its mean: x'' is proportional to 1 / v, and the jerk is constant however much the speed grows. With
+    ratios of 1 this is a spline of degree 2. The coefficients are the values where tangents at neighbouring nodes meet.
     """
 
     def __init__(self, nodes: Array, ratios: Array) -> None:
@@ -109,7 +109,7 @@ class Spline:
         self.share = 2 * before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return a spline whose consecutive coefficients are those of this spline at the given indices `at`."""
+        """Return the spline that consists of those coefficients of this spline that have the indices `at`."""
         part, last = copy(self), len(self.h)
         part.h, part.ratios = (kind[np.minimum(at[:-2], last - 1)] for kind in (self.h, self.ratios))
         nodes = np.minimum(at[:-1], last)
@@ -157,7 +157,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the problem in which only the given intervals are free, and the indices of the coefficients in it."""
+        """Return the problem in which only given intervals are free, and its coefficients' indices in this problem."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -184,7 +184,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions of a spline of the squared speed: fixed coefficients or, at rest, a ratio of the outermost two."""
+    """End conditions of squared-speed splines: at rest, the ratio of the outer two coefficients is fixed; else both."""
 
     def __init__(self, program: Program) -> None:
         n, width, (first, last) = len(program.upper), program.spline.width, program.rest
@@ -254,7 +254,7 @@ class _BandSolver:
 
 
 class _Constraints:
-    """Constraints of a `Program`: positive coefficients, upper bounds of coefficients, then limits of the motion.
+    """Constraints of a `Program`: coefficients are positive and below upper bounds, and the motion keeps its limits.
 
     Values of constraints, shape (M,), are in this order; the jerk limits come last.
 
@@ -329,7 +329,7 @@ class _Constraints:
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Stack the values of all constraints: those on single coefficients `b`, then the motion limits' `rows`."""
+        """Stack the values of all constraints: those on single coefficients `b`, then those on the motion (`rows`)."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _accumulate(self, values: Iterable[Array]) -> Array:
@@ -349,7 +349,7 @@ class _Constraints:
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
             share: Largest share of the way to zero that a step takes.
-            of_positive: The same for the coefficients.
+            of_positive: Largest share of the way to zero for the coefficients.
         """
         runs = np.minimum.reduceat(rates, self.runs)
         last = len(self.middles)
@@ -376,8 +376,8 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     Args:
         program: Program of the stretch.
         start: Positive initial coefficients; they need not satisfy the rows. Shape (N + 2,).
-        accuracy: Relative accuracy of the time, and of all else if less accurate than the accepted values.
-        center: Initial complementarity over the time.
+        accuracy: Relative accuracy of the time; other tolerances are loosened if they are tighter than it requires.
+        center: Initial complementarity (sum of slacks times multipliers) divided by the time.
 
     Raises:
         SolveError: No motion that satisfies the rows was found, with the distance of the worst row as `time`.
@@ -471,7 +471,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return the relative residuals of constraints with slack variables; the first `count` always hold and give 0."""
+    """Return the relative residuals of constraints with slack variables; 0 for the first `count`, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)

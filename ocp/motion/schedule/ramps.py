@@ -145,7 +145,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
-    """Return a fast rest-to-rest speed profile through parts of a path that have constant limits each.
+    """Return a fast rest-to-rest speed profile through consecutive parts of a path, each with constant limits.
 
     Two passes find the speeds at the bounds of the parts; in each part the motion between these is the fastest. The
     result is time-optimal for one part, and for several under the condition of zero acceleration at their bounds.
@@ -244,7 +244,7 @@ class _Bounds(NamedTuple):
 def reachability_passes(
     distance: Array, caps: Array, rows: Array, jumps: tuple[NDArray[np.intp], Array]
 ) -> tuple[Array, Array, Array]:
-    """Return the greatest squared speeds at path nodes (N + 1,), by a backward and a forward pass, and accelerations.
+    """Return the greatest squared speeds at path nodes (N + 1,), and accelerations, by a backward and a forward pass.
 
     Args:
         distance: Distances of the nodes. Shape (N + 1,), m.
@@ -256,7 +256,7 @@ def reachability_passes(
         The squared speeds, and the accelerations where each interval begins and where it ends. Shape (N,).
 
     Raises:
-        ProblemError: The motion must stop at a node, its distance (m) as `time`.
+        ProblemError: The motion must stop at a node; `time` is the distance of this node, m.
     """
     h, (at, before), bounds, bounds_before = np.diff(distance), jumps, _Bounds.build(rows), _Bounds.build(jumps[1])
     most = bounds.feasible(caps)
@@ -302,8 +302,8 @@ def reachability_passes(
 def _greatest_squares(caps: Array, near: tuple[Array, Array], far: tuple[Array, Array]) -> Array:
     """Return the greatest squared speeds x <= `caps` at N + 1 nodes with max(a x[k + 1] + b) <= min(c x[k] + d).
 
-    Howard's policy iteration: all nodes are solved with the lines that are active at the last solution, until these are
-    the active ones.
+    Howard's policy iteration: all nodes are solved with the lines that are active at the last solution, until the
+    active lines stay the same.
 
     Args:
         caps: Upper bounds. Shape (N + 1,).

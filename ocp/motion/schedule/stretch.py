@@ -121,9 +121,9 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, Array, Window, EnforcedRows, int]:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    The second motion shows the intervals to split; the window, its limits and the number of intervals before the seam
-    are returned as they then are. If few intervals still violate limits, these are planned again with their neighbours,
-    between fixed motions. The first intervals beyond the seam must keep the limits as well.
+    Intervals are split once, as the second motion requires; the window, its limits and the number of intervals before
+    the seam are returned after the split. If few intervals still violate limits, these are planned again with their
+    neighbours, between fixed motions. The first intervals beyond the seam must keep the limits as well.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
@@ -169,11 +169,11 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int) -> tuple[Array, 
 
 
 def _parts_by_unused_jerk(window: Window, seam: int, profile: SpeedProfile, values: Array) -> NDArray[np.intp]:
-    """Return into how many parts to split each interval so that unused jerk costs about the share `lost` of the time.
+    """Return the number of parts of each interval with which unused jerk costs about SETTINGS.lost of the duration.
 
     Where the mean jerk is (1 - u) J in a time T, the greatest jerk J and then (1 - 2 u) J would lead to a speed that is
-    u J T^2 / 4 higher. The acceleration, which is at least J T, takes the time of that speed over it; on average, half
-    of this is saved on the way to the top speed. Of this loss, 1 / n^2 remains in n parts.
+    u J T^2 / 4 higher. Its ratio to the acceleration, which is at least J T, is a time, half of which would be saved on
+    average on the way to the top speed. Of this loss, 1 / n^2 remains with n parts.
     """
     requested = window.grid.requested[window.first : window.last]
     speed = np.minimum(profile.speed[:-2:2], profile.speed[2::2]) / requested
@@ -272,11 +272,11 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(
     profile: SpeedProfile, samples: _Samples, places: tuple[Array, tuple[NDArray[np.intp], ...]], requested: Array
 ) -> tuple[Array, Array]:
-    """Return the largest ratio to its limit of a quantity except jerk: at five points and over each interval.
+    """Return the largest ratio of any quantity except jerk to its limit: at five points and over each interval.
 
     The points are the start, the first Gauss point, the middle, the second Gauss point and the end. `places` are the
-    distances of the inner ones and the indices of all. Each row is interpolated by a parabola through start, middle and
-    end; its error at the Gauss points, where the error of a cubic is largest, is added. Shapes (5, N) and (N,).
+    distances of the inner points and the indices of all. Each row is interpolated by a parabola through start, middle
+    and end; its error at the Gauss points, where that of a cubic is largest, is added. Shapes (5, N) and (N,).
     """
     inside, count = profile.at_distance(places[0].ravel()), len(requested)
     t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
@@ -375,8 +375,8 @@ def _resolve(program: Program, known: Array, accuracy: float) -> Array:
 def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
     """Return an initial guess of the squared speeds at nodes (N + 1,) that approximately satisfies the jerk limits.
 
-    From rest, squared speed to the power 3/4 grows by the square root of 9/2 of the jerk times the distance; a known
-    motion may slow down likewise.
+    From rest at a constant jerk J, the squared speed to the power 3/4 grows by sqrt(9/2 J) times the distance; a known
+    motion at an end may slow down at the same rate.
     """
     steady = np.minimum(left.steady()[0], right.steady()[0])
     y = (SETTINGS.start * np.minimum(most, node_minimum(steady) ** 2)) ** 0.75
@@ -412,7 +412,7 @@ def _spline_rows(
 
     Args:
         places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
-        mask: Which of them are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
+        mask: Which limit rows are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the limits that each interval may use.
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.

@@ -100,9 +100,9 @@ class Window(Stretch):
         return cls(grid, first, last, ends, rows=every, bends=bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return coefficients of all limit inequalities at closely spaced points in intervals, by point, then interval.
+        """Return the coefficients of all limits at closely spaced points in intervals, sorted by point, then interval.
 
-        The points divide each interval into SETTINGS.fine parts. Torque limits, which take longest, are optional.
+        The points divide each interval into SETTINGS.fine parts. Torque limits, slowest to compute, are optional.
         """
         parts = SETTINGS.fine
         missing = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
@@ -156,7 +156,7 @@ class EnforcedRows:
         times: Number of reductions of each margin.
         mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
-        ratios: Speed where each interval begins over its mean there, see `Spline`. Shape (N,).
+        ratios: Ratio of the speed at the beginning of each interval to its mean; see `Spline`. Shape (N,).
         inherited: Number of intervals taken over from the previous window.
     """
 
@@ -223,9 +223,9 @@ class EnforcedRows:
         self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce each limit at its point of highest usage in an interval; return which were enforced there before.
+        """Enforce each limit at its point of highest usage in an interval; return which limits already were enforced.
 
-        Masks of shape (2, N, K + L + P).
+        `rows` and the result are masks of shape (2, N, K + L + P).
         """
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
@@ -235,7 +235,7 @@ class EnforcedRows:
         return already
 
     def lower(self, used: Array, mask: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Tighten the limits that are violated although they are enforced, by more at each call.
+        """Reduce the usable share of each enforced limit that the computed motion still exceeds, by more at each call.
 
         `used` is the usage of the limits and `mask` tells which are enforced. Shape (2, N, K + L + P). The next window
         begins at the interval `seam`.
@@ -255,7 +255,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
-    """Return the speed profile from squared speeds, and their slopes by distance, at the first nodes of a path part."""
+    """Return the speed profile through the first nodes of a path part, from squared speeds and their slopes there."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
@@ -263,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return each quantity's largest ratio to its limit in given intervals, and its ratios where limits are enforced.
+    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -369,7 +369,7 @@ def _fine_usage(
 
 
 def parabola_peak(values: Array, places: Sequence[Array | float]) -> Array:
-    """Return the extreme value of a parabola between the first and last of three points, or the first value."""
+    """Return the extreme value of a parabola through three points if it lies between these, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -352,7 +352,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return an error that no state can be continued; it names the joint limit that stops most states."""
+        """Return an error that says that no state can be continued, and which joint limit stops most states."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -396,7 +396,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return K motions through states at L times; `paths` (L, K) has the index of each state at its time."""
+        """Return K motions; `paths` (L, K) has the indices of their states among the states at each of L times."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -303,7 +303,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Project boundary points of charts onto the manifold; return projections (nan if failed) and the offsets."""
+        """Project boundary points of charts onto the manifold; return projections (nan if failed) and their offsets."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))

@@ -234,7 +234,7 @@ def check_clear_start(request: PlanRequest, configurations: Array) -> None:
 def count_clear_configurations(request: PlanRequest, time: float) -> int | Unreachable | None:
     """Count the collision-free configurations that satisfy the tasks at a time, s; return an error if there are none.
 
-    The result is None if it would prove nothing: no task gives a pose then, or the base may be elsewhere.
+    The result is None if it would prove nothing: no task prescribes a pose at this time, or the base can move.
     """
     tasks = [task for task in request.tasks if task.is_pose and task.begin <= time <= task.end]
     if request.clearance_constraints is None or not tasks or request.machine.base_size:
@@ -247,7 +247,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Return a list with one text about the number of collision-free configurations; empty if it is unknown."""
+    """Return a list with one text about the number of collision-free configurations; empty if `count` is None."""
     if count is None:
         return []
     if isinstance(count, Unreachable):

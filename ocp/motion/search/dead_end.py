@@ -381,7 +381,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """From a guess (K, n), find the path of least tip position (if `turning`, orientation) error; None on failure."""
+    """Find the path of least tip position error (orientation error if `turning`) near a guess; None on failure."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()

@@ -92,7 +92,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations with additional equations that fix some joints; their positions are appended to the targets.
+    """Task equations extended by equations that fix some joints; the fixed positions are appended to the targets.
 
     Attributes:
         fixed: Indices of the fixed joints.

@@ -54,10 +54,10 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def dual_terms(self, values: Array) -> Array:
-        """Return the terms of the dual norm: joint values (n, ..., P) if the cost is a sum, their sum if a maximum."""
+        """Return terms whose maximum is the dual norm: joint values (n, ..., P), or their sum for a maximum as cost."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Minimise step plus later cost over the ends of P steps; return lower bounds (P,), multipliers, ends (P, r).
+        """Minimise the cost of P steps and later motion over their ends; return bounds (P,), multipliers, ends (P, r).
 
         Args: As in `minimal_steps`. The least cost of P steps is that of the linear programs
 
@@ -189,7 +189,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of the cost of a step, which is proportional to the step's length, plus the cost of later motion.
+    """Lower bounds of the cost of a step and the later motion, if step costs are proportional to step lengths.
 
     On curves, the multipliers of each start are computed anew, since the cost has kinks. On manifolds of more
     dimensions this would take too long.

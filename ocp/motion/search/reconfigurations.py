@@ -297,7 +297,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths across sections of the manifolds and within single sections, by rising cost, and the bound 0."""
+        """Return paths across and within sections of the manifolds, by rising cost, and the trivial lower bound 0."""
         count, through_centers = len(self.samples), list[Array]()
         for value in range(len(self._values)):
             restricted = copy(self)

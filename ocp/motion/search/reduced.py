@@ -180,7 +180,7 @@ class ReducedKinematics:
             return self.correct_poses(base, joints, end, tolerance)
 
         def remaining(at_end: TaskKinematics, joints: Array) -> Array:
-            """Return the tip displacement that velocity tasks prescribe in this step, less the actual one."""
+            """Return the tip displacement that velocity tasks prescribe in this step minus the actual displacement."""
             straight = (joints - start_joints) * self.root
             parts = ((1, task), (4, middle), (1, at_end))
             return np.asarray(sum(k / 6 * (duration * each.right - each.task_rates(straight)) for k, each in parts))

@@ -290,7 +290,7 @@ class AtlasSearch:
         return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
-        """Project a configuration onto the manifold of a time sample; None if that violates limits or clearance."""
+        """Project a configuration onto the manifold of a time sample; None if this violates limits or clearance."""
         if k == 0 and self.start is not None:
             return self.start
         projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])

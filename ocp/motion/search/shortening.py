@@ -119,7 +119,7 @@ class PathProblem:
 
     @property
     def _manifolds(self) -> list[tuple[Any, Indices, Indices]]:
-        """Sets of manifolds, each with the indices of its samples along the path and the rows of these in the set."""
+        """Sets of manifolds, each with the indices of its samples along the path and of their manifolds in the set."""
         sets, rows = [sample.manifolds for sample in self.samples], np.array([sample.row for sample in self.samples])
         masks = [(each, np.flatnonzero([own is each for own in sets])) for each in dict.fromkeys(sets)]
         return [(each, mask, rows[mask]) for each, mask in masks]
@@ -132,7 +132,7 @@ class PathProblem:
 
     @property
     def dimension(self) -> int | None:
-        """Dimension of the manifolds; None if their dimensions differ."""
+        """Dimension of the self-motion manifolds at the time samples; None if their dimensions differ."""
         sizes = {sample.manifolds.size for sample in self.samples}
         return sizes.pop() if len(sizes) == 1 else None
 
@@ -144,7 +144,7 @@ class PathProblem:
         return bases
 
     def project(self, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Project configurations (K, s, n), s at each time sample, onto the manifolds; return a mask of success too."""
+        """Project configurations (K, s, n), s at each time sample, onto the manifolds; also return a success mask."""
         projected, converged = np.empty(joints.shape), np.empty(joints.shape[:2], dtype=bool)
         for manifolds, rows, indices in self._manifolds:
             flat = joints[rows].reshape(-1, joints.shape[2])
@@ -174,8 +174,8 @@ class PathProblem:
     def distances(self, path: Array, change: Array | None) -> tuple[Indices, Array, Array]:
         """Return sample indices of P close body pairs, distances beyond the clearance, m, and gradients of distance.
 
-        Bodies are close if joint displacements `change` (K, n) may bring them below the clearance; None: if they are
-        below it, without gradients. Shapes (P,), (P,), (P, n).
+        Bodies are close if joint displacements `change` (K, n) may bring them below the clearance. If `change` is None,
+        they are close if they are below it, and the gradients are not computed. Shapes (P,), (P,), (P, n).
         """
         if self.scene is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros((0, path.shape[1]))
@@ -304,7 +304,7 @@ PROGRAM = ProgramSettings()
 
 
 class _Rows(NamedTuple):
-    """Gradients and values of functions of a path of K configurations that are linearised in the joint positions.
+    """Gradients and values of R functions of a path of K configurations, linearised in the joint positions.
 
     Attributes:
         gradient: Sparse matrix. Shape (R, K n).
@@ -362,7 +362,7 @@ class _LocalProgram:
         return scipy.sparse.csr_array(entries, shape=(len(k), self._path.size))
 
     def _cost_rows(self) -> tuple[_Rows, Indices]:
-        """Return linear functions and group numbers; in the trust region the cost is the sum of group maxima."""
+        """Return linear functions in groups; in the trust region the cost is the sum of the maxima of all groups."""
         delta, by_joint = np.diff(self._path, axis=0), isinstance(self._problem.steps.cost, PathLength)
         k, joint, sign = (index.ravel() for index in np.indices((*delta.shape, 2)))
         factor, reach = (2.0 * sign - 1.0) * self._problem.weights[joint], self._size[1:] + self._size[:-1]
@@ -467,7 +467,7 @@ def optimise_path(path: Array, problem: PathProblem, settings: ProgramSettings =
 def optimality_of(path: Array, problem: PathProblem, settings: ProgramSettings = PROGRAM) -> tuple[float, bool]:
     """Return the cost that small displacements of a path (K, n) save, and whether they may save more to second order.
 
-    The displacements are at most `settings.checked`, and the saved cost is that to first order.
+    The displacements are at most `settings.checked`; the saved cost is a first-order estimate.
     """
     if not problem.dimension or len(path) < 2:
         return 0.0, False

@@ -106,7 +106,7 @@ class StepBounds(Protocol):
         """Return values (P,) and gradients (P, r) of the cost bounds for steps that start at chart points (P, r)."""
 
     def descend(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return chart points, by descent from `places`, where the cost bound minus a quadratic function is no higher.
+        """Descend from `places` on the cost bound minus a quadratic function; return the chart points reached.
 
         The function is slope . t + t . curve . t / 2. All arguments have one entry for each step.
         """
@@ -244,7 +244,7 @@ def dot(left: Array, right: Array) -> Array:
 
 
 def _support(points: Array, direction: Array) -> Array:
-    """Return the support function, at least 0, of point sets (c, n, P) in directions (n, P). Shape (P,)."""
+    """Return the support function of point sets (c, n, P), each with the origin, in directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
         np.maximum(support, dot(point, direction), out=support)
@@ -307,7 +307,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the cost bounds over end points in the charts; return steps to chart centres, minima, minimisers."""
+        """Minimise the cost bounds over end points in charts; return steps to target centres, minima, minimisers."""
         start = self.projection - apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
@@ -336,8 +336,8 @@ def rows_first(columns: Array) -> Array:
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes.
 
-    The functions are slope . t + t . square . t / 2. Compared are the corners, the stationary points on the sides, and
-    the stationary point inside. In more dimensions, the result is a lower bound of the minimum, see `_separate`.
+    The functions are slope . t + t . square . t / 2. The corners, the stationary points on the sides and the
+    stationary point inside are compared. For r > 2 the result is a lower bound of the minimum, see `_separate`.
     """
     least, place = _least_in_box(rows_last(slope), rows_last(square), rows_last(low), rows_last(high))
     return least, rows_first(place)
@@ -380,9 +380,9 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
 
 
 def _separate(square: Array) -> Array:
-    """Return lower bounds of symmetric matrices (r, r, P): diagonal ones by Gershgorin's theorem, themselves if r < 3.
+    """Return diagonal lower bounds of symmetric matrices (r, r, P), by Gershgorin's theorem; the matrices if r < 3.
 
-    Each mixed term is at least minus the mean of both squares.
+    Each mixed product x y is at least -(x^2 + y^2) / 2.
     """
     if len(square) < 3:
         return square

@@ -176,7 +176,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Divide the tasks into the fewest segments that one motion each can do; return times and the least number.
+        """Divide the tasks into the fewest segments of one motion each; return times and the least possible number.
 
         Args:
             barred: Begin and end, s, of intervals that are known to be infeasible in one segment.
@@ -209,12 +209,12 @@ class TaskSearch:
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the sample times of each interval with active tasks after inserting additional times."""
+        """Insert additional sample times; return the times of each interval in which the same tasks are active."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     @property
     def near_cost(self) -> float:
-        """Cost below which a motion is close to the bound: its relative gap is twice that which ends the search."""
+        """Cost of a motion whose relative gap to the lower bound is twice the gap at which the search ends."""
         return self.bound / (1 - 2 * self._search.gap)
 
     def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
@@ -225,7 +225,7 @@ class TaskSearch:
         """Add time samples where the best path is near a limit (or `everywhere`), and search again.
 
         Returns:
-            Whether any were added.
+            Whether time samples were added.
         """
         if self._path is None:
             return False
@@ -286,7 +286,7 @@ def require_poses(request: PlanRequest) -> None:
 def choose_samples(
     t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose few times of a motion, such that straight steps between them cost nearly as much as the motion.
+    """Choose few sample times of a motion between which straight steps cost nearly as much as the motion.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.
@@ -388,7 +388,7 @@ def tool_motion_bound(machine: FixedBase, poses: PathPoses, cost: Homogeneous, b
 
 
 def tool_rate_bound(request: PlanRequest) -> float:
-    """Return a lower bound of the cost of all motions that do pose tasks, for any number of redundant joints.
+    """Return a lower bound of the cost of all motions that perform pose tasks, for any number of redundant joints.
 
     The cost is the integral of half the weighted squared joint rates. In a time step h, joints that move by d cost at
     least the sum of w_j d_j^2 / (2 h). With the rows of `_ToolLevers` for each task whose targets are given in world,
@@ -429,8 +429,8 @@ def _angles(rotations: Array) -> Array:
 class _ToolLevers:
     """Upper bounds of the motion of a tool: joint displacements d move its points and turn it by at most levers . |d|.
 
-    The points are the tip and, at a wrist, the point of the last axis nearest to the axis before, of which fewer joints
-    move. The last row is the rotation.
+    The points are the tip and, at a wrist, the point of the last axis that is nearest to the axis before it, because
+    fewer joints move this point. The last row is the rotation.
 
     Attributes:
         machine: The machine whose tip is the tool, on a fixed base.
@@ -467,14 +467,14 @@ class _ToolLevers:
         return cls(machine, (np.array(points) - tip) @ axes, levers)
 
     def distances(self, positions: Array, rotations: Array) -> Array:
-        """Return distances of the points, m, and angles, rad, between successive poses (M, 3), (M, 3, 3) of the tip."""
+        """Return displacements of the points, m, and rotations, rad, between successive tip poses (M, 3), (M, 3, 3)."""
         places = [positions + rotations @ point for point in self.points]
         return np.column_stack(
             [*(np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places), _angles(rotations)]
         )
 
     def task_distances(self, task: TipTask, times: Array) -> Array:
-        """Return how far a task moves and turns the tool between successive times (M,) since its start; 0 if free."""
+        """Return tool displacements and rotations that a task prescribes between times (M,) after its start."""
         still = {"base": np.zeros((len(times), 0)), "joints": np.zeros((len(times), self.machine.joint_size))}
         (target,) = targets_along(self.machine, [replace(task, begin=0.0, duration=None)], times, **still)
         placed, turned = len(task.linear) == 3, set(ANGULAR) <= set(task.chosen)

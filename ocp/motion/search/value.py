@@ -168,7 +168,7 @@ class ChartGraph:
     def _sweep(
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
     ) -> list[QuadraticBounds]:
-        """Propagate lower bounds of the cost through time samples in a given order; return those at each sample."""
+        """Propagate lower bounds of the cost through time samples in a given order; return all bounds."""
         layers = self.layers
         bounds: list[Any] = [None] * len(layers)
         first = order[0]
@@ -185,9 +185,9 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return lower bounds on the cost from the charts of time sample `k`, given those of the `neighbour` sample.
+        """Return lower bounds of the cost from the charts of time sample `k`, given the bounds at sample `neighbour`.
 
-        With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
+        Motions that cost `max_cost` or more, by `known_bounds` of their other part, are left out.
         """
         source, target = self.layers[k], self.layers[neighbour]
         seconds = float(self.seconds[min(k, neighbour)])
@@ -316,8 +316,8 @@ def _best_combination(
 ) -> tuple[QuadraticBounds, Array]:
     """Return for each of P steps the convex combination of two cost bounds with the highest minimum, and its minimum.
 
-    Both have the same curvature. The combinations that are level along an axis are tried. `best_least` is
-    the minimum of the first. Shape (P,).
+    Both bounds have the same curvature. Combinations with zero slope along an axis are tried. `best_least` is the
+    minimum of the first bound. Shape (P,).
     """
     first = best
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -177,7 +177,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _equation_numbers(equations: TaskEquations) -> list[int]:
-    """Return the numbers of the task equations in messages: a single task's twist components 0 to 5, or row indices."""
+    """Return the numbers of task equations for messages: twist components 0 to 5 of a single task, or row indices."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -234,7 +234,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion at one of the times (s, or None) at which the joints must rest."""
+    """Raise ProblemError if a task prescribes motion at a time, s, at which the joints must rest; None is ignored."""
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = f"the task of {part.name!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where the "
@@ -349,10 +349,10 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan where the tasks imply it.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan where the tasks imply rest.
 
-    A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing the rest of these
-    joints too would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task
+    A tip whose velocity or acceleration is prescribed comes to rest by itself, so that prescribing rest for all joints
+    would be redundant. The joints that move the tip most are left free. `rows` is the mask of the task
     equations that come to rest by themselves; all if None.
     """
     rest = np.zeros(len(joints))

@@ -156,9 +156,9 @@ class TaskEquations:
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
         """Return by name the deviations of the tips from their tasks, each as arguments of `Problem.watch`.
 
-        For poses these are their errors, for velocities the integral of their residual; each is judged relative to the
-        path of the tips. A pose may deviate by the start gap of its task, which the feedback closes, and by its
-        tolerance.
+        The deviation of a pose task is its error, that of a velocity task the integral of its residual; each is judged
+        relative to the path of the tip. A pose may deviate by the start gap of its task, which the feedback closes, and
+        by its tolerance.
         """
         tolerances, gaps = self.tolerances, self.by_row(lambda task: task.start_gap)
         gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default gap is not closed
@@ -231,7 +231,7 @@ class TaskEquations:
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return position errors, m, and rotation errors 2 sin(angle / 2), unlike `error` nonzero at half a turn.
+        """Return position errors, m, and rotation errors 2 sin(angle / 2), which are nonzero at half a turn.
 
         If all rotation is prescribed, the rotation errors (near zero the angle in rad) are the differences of the frame
         axes over sqrt 2, otherwise the rows of the half-angle vector. Velocity tasks have no entries. Shape (rows, 1).

@@ -140,7 +140,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances (k, 1), m, of a zero moment point (2, 1) from the support edges, without the constant ones.
+    """Return those distances (k, 1), m, of a zero moment point (2, 1) from the support edges that are not constant.
     Raise ProblemError if a constant distance is negative. `external` states whether external wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
@@ -219,7 +219,7 @@ class JointBounds(NamedTuple):
     power: Array
 
     def tightened(self, other: JointBounds) -> JointBounds:
-        """Return the tighter one of each limit and its counterpart."""
+        """Return, for each joint and quantity, the tighter of both limits."""
         upper = (np.minimum(own, limit) for own, limit in zip(self[1:], other[1:], strict=True))
         return JointBounds(np.maximum(self.lower, other.lower), *upper)
 

@@ -91,7 +91,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; at a stop, the motion on arrival."""
+        """Return the motion at distances (M,) from the start, m; where it stops, its state on arrival counts."""
         length = float(self.distance[-1])
         words = f"m is off the path, which is {length:g} m long"
         s = np.atleast_1d(values_within(distance, length, "distance", words))

@@ -118,7 +118,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Add times to given ones until target poses are nearly linear between neighbouring times. Shape (k,)."""
+    """Insert times until target poses are nearly linear between neighbouring times; return all times (k,)."""
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
     poses, _ = _target_rows(equations)
@@ -135,7 +135,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return where the stacked task targets have pose values (indices) and the velocity of each pose (slices)."""
+    """Return the indices of pose values in the stacked task targets, and the slice of the velocity of each pose."""
     poses, rates, at = list[int](), list[slice](), 0
     for part in equations.bound:
         for pose, rate in part.target_rows.values():

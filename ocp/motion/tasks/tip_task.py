@@ -263,7 +263,7 @@ def _refuse_ramps(reason: str, **arguments: Any) -> None:
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task of a path parameter to one of time; the function `clock` gives the parameter at a time (s)."""
+    """Convert a task stated over a path parameter to a task over time; `clock` maps a time (s) to the parameter."""
 
     def velocity(time: Any) -> Any:
         parameter = clock(time)
@@ -278,7 +278,7 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and one whose tip is the reference frame (None: world).
+    """A task with two machines, whose tips are the task's frame and its reference frame (None for the world).
 
     The methods return expressions of the machine's base configuration and joint positions.
     """
@@ -315,7 +315,7 @@ class BoundTask(NamedTuple):
         return [row for _, rates in self.target_rows.values() for row in range(rates.start, rates.stop)]
 
     def split_targets(self, targets: Any) -> tuple[Any, Any]:
-        """Split targets into (position, velocity) and (rotation or direction, angular velocity); None if free."""
+        """Split targets into (position, velocity) and (rotation or direction, angular velocity); None if absent."""
         parts = {name: (targets[values], targets[rates]) for name, (values, rates) in self.target_rows.items()}
         if "orientation" in parts:
             parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]

@@ -128,7 +128,7 @@ def checked_speed(speed: Any) -> float:
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return position and orientation of a tool on a path as functions of time; problems need symbols=casadi.MX.
+    """Return position and orientation of a tool on a path over time, for problems with symbols=casadi.MX.
 
     The speed is constant, m/s, or that of a SpeedProfile or Schedule of the path.
 
@@ -172,7 +172,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Convert a target of a path parameter to one of time; the function `clock` gives the parameter at a time (s)."""
+    """Convert a target stated over a path parameter to a target over time; `clock` maps a time (s) to the parameter."""
     if not callable(track):
         return track
 

@@ -222,7 +222,7 @@ def chained_capture(
     clearance_constraints: ClearanceConstraints | None = None,
     method: Collocation = POINTS,
 ) -> tuple[Solution, Solution]:
-    """Plan the approach of a capture by itself, then the detumbling from its end, each at its own lowest cost.
+    """Plan a capture phase by phase: the approach at the lowest cost, then the detumbling from the end of the approach.
 
     The total cost exceeds that of `capture_problem`, which has the same arguments.
 
@@ -295,7 +295,7 @@ class _Capture:
 
     @property
     def arm_mask(self) -> Array:
-        """Mask of the arm's joints: 1, and 0 for reaction wheels, whose angles count from 0 again in the detumbling."""
+        """Mask with 1 for arm joints and 0 for reaction wheels, whose angles count from 0 again in the detumbling."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 

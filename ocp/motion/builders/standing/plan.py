@@ -218,8 +218,8 @@ def solve_standing(
 
     The first plan that passes its audit with pose errors below 1e-5 (m, rad) everywhere is returned. Accelerations at
     the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
-    are at the points. If the only failures of a plan are limits exceeded between the points, they are tightened there.
-    Other plans are solved again from themselves on up to two meshes, each twice as fine.
+    are at the points. If the only failures of a plan are limits exceeded between the points, these limits are tightened
+    there. Other plans are solved again from themselves on up to two meshes, each twice as fine.
 
     The `tip_level` of the setup is chosen here, and the `control` of a given mesh selects the only formulation tried.
 

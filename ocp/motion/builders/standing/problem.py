@@ -293,10 +293,10 @@ def declare_joints(
     jerk: bool = False,
     scales: Any = (None,) * 4,
 ) -> tuple[Any, Any, Any, Any]:
-    """Declare joint positions, velocities and accelerations within limits, and jerks if `jerk`; return the symbols.
+    """Declare joint positions, velocities and accelerations within limits, with jerks if requested; return the symbols.
 
-    The last of these quantities is the control, the others are states, whose derivatives are declared. `starts` and
-    `ends` are their values at both ends, None or nan where free, `scales` those for the solver.
+    The last of these quantities is the control; the others are states, whose derivatives are declared. `starts` and
+    `ends` are the values at both ends, None or nan where free; `scales` are the scales of the quantities.
     """
     lower = (bounds.lower, -bounds.velocity, -bounds.acceleration, -bounds.jerk)
     upper = (bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk)

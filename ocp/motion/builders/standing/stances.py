@@ -304,7 +304,7 @@ def check_placed(stance: Stance, joints: Array) -> None:
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
     """Return initial guesses of the joint positions, velocities and accelerations in each phase, in stance joint order.
 
-    Halfway, a foot is by `lift`, m, above the line between its footholds. `start` is in the robot's joint order.
+    Halfway, a foot is `lift` (m) above the line between its footholds. `start` is in the robot's joint order.
     """
     ends, guesses = [start], []
     for k in range(1, len(steps.phases) + 1):

@@ -166,7 +166,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the limit violations of least sum over joint accelerations that fulfil the tasks; None if none do."""
+    """Return the limit violations with the least sum that the tasks permit; None if the tasks cannot be fulfilled."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):

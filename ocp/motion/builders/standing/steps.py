@@ -231,7 +231,7 @@ def _constrain_swing(
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances (k, 1) of the center of mass from the support edges, m, without those that are constant."""
+    """Return the distances (k, 1), m, of the center of mass from support edges, without distances that are constant."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
