@@ -85,7 +85,7 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
             base, joints = ((value[:, k] + value[:, k + 1]) / 2 for value in (motion.base, motion.joints))
             speeds = kinematics.velocity_errors(base, joints, motion.rates[:, k], motion.t[k] + step / 2)
             missing, prescribed = missing + step * speeds[0], prescribed + step * speeds[1]
-    tracked = np.array(largest_pose_errors(list(motions))) <= REACH_TOLERANCE
+    tracked = largest_pose_errors(motions) <= REACH_TOLERANCE
     return np.asarray(tracked & (missing <= MAX_VELOCITY_ERROR * prescribed))
 
 
@@ -277,10 +277,10 @@ class _CellPass:
         )
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
         displacement = np.abs(joints - start_joints)[:, self._effective].max(axis=1, initial=0.0)
-        finite = np.isfinite(base).all(axis=1) & (displacement <= self._settings.longest)
+        valid = np.isfinite(base).all(axis=1) & (displacement <= self._settings.longest)
         expanded = _Layer(time, base, joints, cost, parents)
-        expanded = expanded.select(np.flatnonzero(finite & (cost <= self.max_cost) & (error <= REACH_TOLERANCE)))
-        expanded = expanded.select(np.flatnonzero(self._valid_states(kinematics, expanded)))
+        expanded = expanded.select(valid & (cost <= self.max_cost) & (error <= REACH_TOLERANCE))
+        expanded = expanded.select(self._valid_states(kinematics, expanded))
         if not len(expanded.cost):
             return None, limit_counts
         best = self._best_of_cells(expanded.base, expanded.joints, expanded.cost, resize=False)
@@ -343,8 +343,7 @@ class _CellPass:
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
         """Move states to the poses of the tasks that begin at this time; return the states that reach them."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
-        corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
-        base, joints, pose_error = corrected
+        base, joints, pose_error = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         cost = layer.cost + ((self.root * (joints - layer.joints)) ** 2).sum(axis=1) / (2 * layer.time)
         reached = np.flatnonzero(pose_error <= REACH_TOLERANCE)
         if not reached.size:

@@ -270,7 +270,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
     lower[turning], upper[turning] = -np.inf, np.inf
     motions = _track_within(request, configurations, lower, upper)
     motions = _within_limits(request, configurations, motions) if turning.size else motions
-    if min(largest_pose_errors(motions)) > REACH_TOLERANCE:
+    if largest_pose_errors(motions).min() > REACH_TOLERANCE:
         _check_reach(request, motions)
     return motions
 
@@ -295,7 +295,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
                 times = resolving_times(equations, times)
                 motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
-        if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:
+        if largest_pose_errors(motions).min() <= REACH_TOLERANCE:
             return motions
         least_damped = least_damped or motions
     return least_damped
@@ -307,7 +307,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
     shifts, fits = whole_turns_into(joints, *limits)
-    tracked, inside = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE, fits.all(axis=1)
+    tracked, inside = largest_pose_errors(motions) <= REACH_TOLERANCE, fits.all(axis=1)
     shifted = [motion.take(inside) for motion in motions]
     for motion in shifted:
         motion.joints[:, :, turning] += shifts[inside, None]
@@ -345,9 +345,22 @@ def _joints_at_new_poses(
     return np.asarray(turned[np.arange(len(joints)), distances.argmin(axis=1)])
 
 
-def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
-    """Return the largest pose error of each of K motions over the whole horizon, m or rad."""
-    return np.max([motion.pose_error for motion in motions], axis=0).tolist()  # type: ignore[no-any-return]
+def largest_pose_errors(motions: Sequence[LocalMotion]) -> Array:
+    """Return the largest pose error of each of K motions over the whole horizon, m or rad. Shape (K,)."""
+    return np.asarray(np.max([motion.pose_error for motion in motions], axis=0))
+
+
+def lowest_cost_motion(motions: Sequence[LocalMotion]) -> tuple[int, float]:
+    """Return the index and the cost of the lowest-cost one of K motions among those that reach all poses.
+
+    If none of them does, it is the lowest-cost one of all, and the returned cost is inf.
+    """
+    costs, tracked = (
+        np.sum([motion.cost for motion in motions], axis=0),
+        largest_pose_errors(motions) <= REACH_TOLERANCE,
+    )
+    best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
+    return best, float(costs[best]) if tracked[best] else np.inf
 
 
 def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
@@ -454,14 +467,13 @@ def end_of_reach(
     begin, end = interval
     reach = _Reach(bind(machine, tasks), {"starts": starts, "seed": seed}, np.zeros((0, machine.joint_size)))
     grid = np.linspace(begin, end, REACH.intervals + 1)
-    within, miss = begin, None
-    for beyond in (*grid[grid < failed].tolist(), failed, *grid[grid > failed].tolist()):
+    within = begin
+    for beyond in (*grid[grid < failed].tolist(), failed):
         if (miss := reach.unreachable_at(beyond, limits)) is not None:
             break
-        if beyond >= failed:
-            return None
         within = beyond
-    assert miss is not None
+    else:
+        return None
     first, nearest = beyond, miss
     for _ in range(REACH.bisections if beyond > within else 0):
         middle = (within + beyond) / 2

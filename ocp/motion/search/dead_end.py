@@ -122,12 +122,6 @@ class DeadEnd(SolveError):
         proven: Whether the search proves, under its assumptions, that no motion exists.
     """
 
-    until: float
-    obstructions: tuple[Obstruction, ...]
-    relaxations: tuple[Relaxation, ...]
-    segments: int | None
-    proven: bool
-
     def __init__(
         self,
         words: str,
@@ -142,10 +136,6 @@ class DeadEnd(SolveError):
         super().__init__(words, **details)
         self.until, self.obstructions, self.relaxations = until, obstructions, relaxations
         self.segments, self.proven = segments, proven
-
-    def __reduce__(self) -> Any:
-        """Return the data from which `pickle` rebuilds the error: its class, arguments and fields."""
-        return type(self), (*self.args, self.until, self.obstructions, self.relaxations), self.__dict__
 
 
 def dead_end(

@@ -26,11 +26,10 @@ from ocp.errors import ProblemError, SolveError
 from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.local.inverse_kinematics import Unreachable, sample_starts
 from ocp.motion.search.configurations import (
-    REACH_TOLERANCE,
     PlanRequest,
     check_clear_start,
-    largest_pose_errors,
     local_motions_from,
+    lowest_cost_motion,
     start_collisions,
     start_configurations,
 )
@@ -272,9 +271,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
     weights = request.weights.copy()
     weights[columns] *= STIFFNESS
     motions = local_motions_from(replace(request, weights=weights), configurations)
-    costs = np.sum([motion.cost for motion in motions], axis=0)
-    tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
-    best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
+    best, _ = lowest_cost_motion(motions)
     return request.with_held(_positions_by_name(request.machine, motions[0].joints[best, 0], columns))
 
 

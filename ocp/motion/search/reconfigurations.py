@@ -193,12 +193,12 @@ def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: 
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
-            graph = search.restrict(starts[0], ends[0]).full_graph()
+            graph = search.restrict(starts[0], ends[0]).graph()
             values = graph.cost_to_go()
             bounds |= {(k, ends[0]): float(graph.minima(values[k - starts[0]], k - starts[0]).min()) for k in starts}
             continue
         for first in starts:
-            graph = search.restrict(first, ends[-1]).full_graph()
+            graph = search.restrict(first, ends[-1]).graph()
             values = graph.cost_to_come()
             bounds |= {(first, k): float(graph.minima(values[k - first], k - first).min()) for k in ends if k >= first}
     return bounds
@@ -303,7 +303,7 @@ class SectionSearch(AtlasSearch):
             restricted = copy(self)
             restricted.layers = [charts.select(charts.layer // count == value) for charts in self.layers]
             if all(len(charts) for charts in restricted.layers):
-                path = restricted._path_through_centers(restricted.full_graph())
+                path = restricted._path_through_centers(restricted.graph())
                 through_centers += [path] if path is not None else []
         best = sorted(through_centers, key=self.path_cost)[: self.settings.max_classes]
         shortened = [self.find_path(np.inf)[1], *(self._shorten(path, self.layers) for path in best)]

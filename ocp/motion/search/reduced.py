@@ -19,12 +19,14 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, center_of_mass
 from models.checks import Array
 from models.spatial import rotation, rotation_from_quaternion
 from ocp.motion.local.inverse_kinematics import Unreachable, gauss_newton, sample_starts, unreachable_error
+from ocp.motion.search.configurations import REACH_TOLERANCE
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds
@@ -32,8 +34,6 @@ from ocp.motion.tasks.tip_task import ANGULAR, TipTask
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-START_GAP = 1e-4
-"""Largest pose error, m or rad, with which a tip counts as being at its pose when a task starts."""
 SIMPSON_STEPS = 400
 """Number of steps of Simpson's rule, which integrates a tip velocity to a displacement."""
 
@@ -270,8 +270,6 @@ def limit_rates(
 
 STARTS = 64
 """Number of random joint positions and attitudes from which inverse kinematics starts at each time."""
-PLACE_TOLERANCE = 1e-4
-"""Largest pose error at which a pose counts as reached, m or rad."""
 CHECKED_TIMES = 17
 """Number of times at which the reach of poses is tested before the first failure is located by bisection."""
 
@@ -328,9 +326,9 @@ def check_floating_reach(
         residual = equations.pose_residual(base_then, z[:n], ca.SX(ca.DM(targets)))
         function = ca.Function("pose_residual", [z], [residual, ca.densify(ca.jacobian(residual, z))], {"cse": True})
         candidates, errors = gauss_newton(
-            function, np.vstack([solutions, starts]), *limits, tolerance=PLACE_TOLERANCE, iterations=100
+            function, np.vstack([solutions, starts]), *limits, tolerance=REACH_TOLERANCE, iterations=100
         )
-        reached = errors <= PLACE_TOLERANCE
+        reached = errors <= REACH_TOLERANCE
         if reached.any():
             solutions = candidates[reached][:STARTS]
             return None
@@ -364,18 +362,16 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
         time: Time since the begin of the task, s.
     """
     if task.is_pose:
-        return task if task.start_gap <= START_GAP else None
+        return task if task.start_gap <= REACH_TOLERANCE else None
     rows = [row for row in task.chosen if row not in ANGULAR]
     if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
         return None
     equations = bind(machine, task)
     times = np.linspace(0.0, time, SIMPSON_STEPS + 1)
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    weights = np.ones(SIMPSON_STEPS + 1)
-    weights[1:-1:2], weights[2:-1:2] = 4, 2
     displacement = np.zeros(3)
     velocities = values[[task.chosen.index(row) for row in rows]]
-    displacement[[row - 3 for row in rows]] = velocities @ weights * time / SIMPSON_STEPS / 3
+    displacement[[row - 3 for row in rows]] = scipy.integrate.simpson(velocities, dx=time / SIMPSON_STEPS)
     origin, _ = equations.bound[0].pose_in_reference(ca.DM(base), ca.DM(start))
     return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 

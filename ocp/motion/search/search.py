@@ -171,17 +171,13 @@ class AtlasSearch:
         free[at[largest < scene.clearance]] = False
         return free
 
-    def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
+    def graph(self, layers: list[Charts] | None = None, max_costs: Any = np.inf) -> ChartGraph:
         """Return the graph whose nodes are manifold charts and whose edges are steps of limited cost between charts.
 
-        Each step costs at most `max_costs`: one value for all steps, or shape (K - 1,).
+        Each step costs at most `max_costs`: one value for all steps, or shape (K - 1,). The default is all charts.
         """
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
-        return ChartGraph(self.space, layers, self._steps, max_costs)
-
-    def full_graph(self) -> ChartGraph:
-        """Return the graph of all possible steps between the initial charts of the self-motion manifolds."""
-        return self.graph(self.layers)
+        return ChartGraph(self.space, self.layers if layers is None else layers, self._steps, max_costs)
 
     def restrict(self, first: int, last: int) -> AtlasSearch:
         """Return the search restricted to the time samples from `first` to `last`, both included."""
@@ -236,10 +232,8 @@ class AtlasSearch:
             path = None if full else self._path_through(graph, k, chart, cost_to_come, cost_to_go)
             if path is None:
                 self.unresolved.append((lower_bound, k, graph.layers[k].centers[chart]))
-            differences = (np.abs(self.space.difference(path, known)).max() for _, known in paths if path is not None)
-            if path is None or any(difference < self.settings.same_path for difference in differences):
-                continue
-            paths.append((self.path_cost(path), path))
+            elif all(np.abs(self.space.difference(path, known)).max() >= settings.same_path for _, known in paths):
+                paths.append((self.path_cost(path), path))
         return [path for _, path in sorted(paths, key=lambda entry: entry[0])]
 
     def _path_through(
@@ -263,14 +257,8 @@ class AtlasSearch:
             for neighbour in order:
                 previous = neighbour - int(np.sign(order.step))
                 candidates = graph.successors(current, previous, neighbour, values[neighbour])
-                successor = next(
-                    (
-                        configuration
-                        for candidate in candidates
-                        if (configuration := self.project_in_box(neighbour, *candidate)) is not None
-                    ),
-                    None,
-                )
+                projected = (self.project_in_box(neighbour, *candidate) for candidate in candidates)
+                successor = next((each for each in projected if each is not None), None)
                 if successor is None:
                     return None
                 current = current + self.space.difference(successor, current)
@@ -370,9 +358,11 @@ class AtlasSearch:
             if coarse:
                 self._cost_bounds, coarse = (graph, cost_to_go, cost_to_come), False
             through = [graph.cost_through(cost_to_come, cost_to_go, k) for k in range(len(layers))]
-            bounds = cost_to_come, cost_to_go
-            before, after = ([float(graph.minima(each, k).min()) for k, each in enumerate(v)] for v in bounds)
-            remaining = np.maximum(remaining, np.array(before[:-1]) + np.array(after[1:]))
+            before, after = (
+                np.array([graph.minima(each, k).min() for k, each in enumerate(bounds)])
+                for bounds in (cost_to_come, cost_to_go)
+            )
+            remaining = np.maximum(remaining, before[:-1] + after[1:])
             promising = [np.flatnonzero(total < target * best_cost) for total in through]
             if not all(len(rows) for rows in promising):
                 return best_path, target * best_cost

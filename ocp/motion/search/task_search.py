@@ -20,13 +20,7 @@ from ocp.errors import BoundWarning, ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
-from ocp.motion.search.configurations import (
-    REACH_TOLERANCE,
-    PlanRequest,
-    largest_pose_errors,
-    local_motions_from,
-    locate_error,
-)
+from ocp.motion.search.configurations import PlanRequest, local_motions_from, locate_error, lowest_cost_motion
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import FULL_TURN, TOLERANCE, JointSpace
 from ocp.motion.search.lengths import Homogeneous
@@ -100,15 +94,11 @@ class TaskSearch:
         if machine.base_size:
             words = "search='global' needs a machine on a fixed base; use search='configurations'"
             raise ProblemError(words, name="search", value="global")
-        costs = np.sum([motion.cost for motion in motions], axis=0)
-        tracked = passing = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
-        self._known_cost = float(costs[tracked].min()) if tracked.any() else np.inf
-        if not tracked.any():  # a motion that stops at a limit does not show how far its joints turn
+        best, self._known_cost = lowest_cost_motion(motions)
+        if not np.isfinite(self._known_cost):  # a motion that stops at a limit does not show how far its joints turn
             unlimited = replace(request, limits=replace(request.limits, joints=False))
             motions = local_motions_from(unlimited, motions[0].joints[:, 0])
-            costs = np.sum([motion.cost for motion in motions], axis=0)
-            passing = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
-        best = int(np.where(tracked | passing | ~(tracked | passing).any(), costs, np.inf).argmin())
+            best, _ = lowest_cost_motion(motions)
         self.space = JointSpace(machine, bounds.lower, bounds.upper, request.weights)
         self.bound = 0.0
         times = list[Array]()
@@ -339,10 +329,8 @@ def lower_bound_along(
     chosen = np.flatnonzero(np.isin(times, choose_samples(times, path, problem.steps.cost, loss, **options)))
     manifolds = SelfMotionManifolds(whole.space, whole.equations, whole.targets[chosen])
     limits = np.add.reduceat(problem.steps.limits, chosen[:-1], axis=0)
-    steps, samples = (
-        Steps(times[chosen], problem.steps.cost, limits),
-        [TimeSample(manifolds, k) for k in range(len(chosen))],
-    )
+    steps = Steps(times[chosen], problem.steps.cost, limits)
+    samples = [TimeSample(manifolds, k) for k in range(len(chosen))]
     for growth in LARGER_CHARTS:
         point, curve, surface = (growth * radius for radius in settings.radii)
         larger = replace(settings, radii=(point, curve, surface))

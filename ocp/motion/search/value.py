@@ -14,7 +14,7 @@ order for lengths, whose bounds are affine.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -169,14 +169,13 @@ class ChartGraph:
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
     ) -> list[QuadraticBounds]:
         """Propagate lower bounds of the cost through time samples in a given order; return all bounds."""
-        layers = self.layers
-        bounds: list[Any] = [None] * len(layers)
+        bounds: list[Any] = [None] * len(self.layers)
         first = order[0]
-        count, free = layers[first].low.shape
-        bounds[first] = QuadraticBounds.constant(np.zeros(count), free)
+        count, free = self.layers[first].low.shape
+        least = np.zeros(count)
         if known_bounds is not None:
-            excluded = self.minima(known_bounds[first], first) >= max_cost
-            bounds[first] = QuadraticBounds.constant(np.where(excluded, np.inf, 0.0), free)
+            least[self.minima(known_bounds[first], first) >= max_cost] = np.inf
+        bounds[first] = QuadraticBounds.constant(least, free)
         for k in order[1:]:
             rest = None if known_bounds is None else known_bounds[k]
             bounds[k] = self._propagate(k, k - direction, bounds[k - direction], rest, max_cost)
@@ -280,23 +279,22 @@ def _bound_charts(
     count = np.diff(np.append(starts, len(charts)))
     group = np.repeat(np.arange(len(starts)), count)
     middle, half = (charts.low + charts.high) / 2, (charts.high - charts.low) / 2
-    places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
+    sides = [side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)]
+    places = np.stack([middle, *(middle + side for side in sides)])
     # minus the curvature of the lowest-cost step and the concavity of their minimum, bounds are nearly affine
-    tangents, curves = [steps.at(place) for place in places], steps.curve
-    curve = curves[np.lexsort((tangents[0][0], group))[starts]].copy()
-    heights = np.minimum.reduceat(np.stack([value for value, _ in tangents]), starts, axis=1)
-    heights = np.minimum(heights, max_costs)
-    curve += _concavity(heights - _quadratic_at_places(curve, places, starts), half[starts], curve)
+    values, slopes = (np.stack(parts) for parts in zip(*map(steps.at, places), strict=True))
+    curves = steps.curve
+    curve = curves[np.lexsort((values[0], group))[starts]].copy()
+    heights = np.minimum(np.minimum.reduceat(values, starts, axis=1), max_costs)
+    curve += _concavity(heights - _quadratic(curve, places[:, starts]), half[starts], curve)
     common = curve[group]
-    values = np.stack([tangent[0] - _quadratic(common, place) for tangent, place in zip(tangents, places, strict=True)])
-    slope = _secant_slopes([*(heights - _quadratic_at_places(curve, places, starts))], half[starts])
+    slope = _secant_slopes(heights - _quadratic(curve, places[:, starts]), half[starts])
     # bound how far the steps lie above the linear functions by tangent planes at points where they are low
     tilt, rows = slope[group], np.arange(len(charts))
-    excess = values - np.stack([(place * tilt).sum(axis=1) for place in places])
+    excess = values - _quadratic(common, places) - (places * tilt).sum(axis=2)
     upper, best_place = np.minimum.reduceat(excess.min(axis=0), starts)[group], excess.argmin(axis=0)
-    stacked = (np.stack(parts)[best_place, rows] for parts in (places, *zip(*tangents, strict=True)))
-    lowest, value, slope_at = stacked
-    best = _tangent_bounds(lowest, (value, slope_at), curves, common, tilt)
+    lowest, *tangents = (part[best_place, rows] for part in (places, values, slopes))
+    best = _tangent_bounds(lowest, tangents, curves, common, tilt)
     least = best.minimum(charts.low, charts.high)[0]
     for _ in range(settings.tangents):  # only steps that may determine the minimum of their chart
         undecided = np.flatnonzero(least[rows] < upper[rows])
@@ -333,17 +331,13 @@ def _best_combination(
     return best, best_least
 
 
-def _quadratic(curve: Array, place: Array) -> Array:
-    """Return half the value of the quadratic form with matrix `curve` at each of P points. Shape (P,)."""
-    return np.asarray((place * np.einsum("pab,pb->pa", curve, place)).sum(axis=1) / 2)
-
-
-def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> Array:
-    return np.stack([_quadratic(curve, place[starts]) for place in places])
+def _quadratic(curve: Array, places: Array) -> Array:
+    """Return half the values of P quadratic forms with matrices `curve`, each at its own points (..., P, r)."""
+    return np.asarray((places * np.einsum("pab,...pb->...pa", curve, places)).sum(axis=-1) / 2)
 
 
 def _tangent_bounds(
-    places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
+    places: Array, values: Sequence[Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
     """Return quadratic lower bounds that touch the cost bounds at given points, minus a common quadratic function.
 
@@ -366,16 +360,13 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
     return second_differences[:, :, None] * np.eye(half.shape[1])
 
 
-def _secant_slopes(values: list[Array], half: Array) -> Array:
+def _secant_slopes(values: Array, half: Array) -> Array:
     """Estimate the slopes of cost bounds along chart axes from values in the middle and at the ends of each axis.
 
     Shape (M, r). A concave function gets the slope from end to end, a convex one the flattest slope.
     """
-    slopes = np.zeros(half.shape)
-    for axis in range(half.shape[1]):
-        low, high = values[1 + 2 * axis], values[2 + 2 * axis]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first, last = (values[0] - low) / half[:, axis], (high - values[0]) / half[:, axis]
-        flat = np.clip(0.0, first, np.maximum(first, last))
-        slopes[:, axis] = np.where(half[:, axis] > 0, np.where(first < last, flat, (first + last) / 2), 0.0)
-    return slopes
+    middle, low, high = values[0][:, None], values[1::2].T, values[2::2].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, last = (middle - low) / half, (high - middle) / half
+    flat = np.clip(0.0, first, np.maximum(first, last))
+    return np.where(half > 0, np.where(first < last, flat, (first + last) / 2), 0.0)

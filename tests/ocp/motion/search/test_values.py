@@ -374,7 +374,7 @@ def test_pruned_steps_change_no_bound(kind: Any, monkeypatch: pytest.MonkeyPatch
     """All steps to every chart that limits allow, beside those that are thought to be worth it."""
     machine, _, places, weights = random_case(4)
     search = search_of(machine, places, kind(weights))
-    graph = search.full_graph()
+    graph = search.graph()
     some = [graph.cost_to_go(), graph.cost_to_come()]
     monkeypatch.setattr("ocp.motion.search.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
     whole = [graph.cost_to_go(), graph.cost_to_come()]
@@ -392,7 +392,7 @@ def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: 
     machine, lengths, places, weights = random_case(seed)
     cost, seconds, rng = kind(weights), SECONDS / (TIME_SAMPLES - 1), np.random.default_rng(seed)
     search = search_of(machine, places, cost)
-    graph = search.full_graph()
+    graph = search.graph()
     nodes = [reached(lengths, place, float(machine.robot.upper[0]), 400) for place in places]
     value = [np.zeros(len(nodes[-1]))]
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
@@ -432,7 +432,7 @@ def test_a_bound_leans_as_what_it_bounds_from_end_to_end_and_where_that_bends_up
         return np.asarray((places * (slope + bend / 2 * places)).sum(axis=1))
 
     sides = [side * half * np.eye(free)[axis] for axis in range(free) for side in (-1.0, 1.0)]
-    result = _secant_slopes([value(place) for place in (np.zeros_like(half), *sides)], half)
+    result = _secant_slopes(np.array([value(place) for place in (np.zeros_like(half), *sides)]), half)
     # of the lines below a parabola at its ends and its middle the flattest; of one that bends down the chord
     flattest = np.sign(slope) * np.maximum(np.abs(slope) - bend * half / 2, 0.0)
     np.testing.assert_allclose(result, flattest if bend > 0 else slope, atol=1e-12)
