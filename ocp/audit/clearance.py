@@ -330,17 +330,9 @@ class _Search:
         rotations, positions = self.track.frames(self.when)
         each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]
-        return [
-            ClosestPair(
-                bodies,
-                float(bounds[i]),
-                float(self.best[i]),
-                float(self.when[i] * self.track.horizon),
-                points[i],
-                float(self.apart.least[i]),
-            )
-            for i, bodies in enumerate(self.apart.labels)
-        ]
+        numbers = (part.tolist() for part in (bounds, self.best, self.when * self.track.horizon))
+        rows = zip(self.apart.labels, *numbers, points, self.apart.least.tolist(), strict=True)
+        return [ClosestPair(*row) for row in rows]
 
     def _evaluate_at_closest_balls(self) -> None:
         """Compute the distance of each pair at the node or interval midpoint where its bounding balls are closest."""

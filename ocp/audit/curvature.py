@@ -140,7 +140,7 @@ def _sweep(
     cost = np.zeros((m, m))
     cost[:nz, :nz] = sweep.end_cost
     least, time, inconclusive = np.inf, None, ""
-    gains: list[_Gain] = []
+    gains: list[np.ndarray] = []  # optimal feedback of each stage, from a state variation to the control variations
     gain = np.zeros(n)
     for k in reversed(range(n)):
         lift, move, stage_cost, remaining = stages[k]
@@ -173,7 +173,7 @@ def _sweep(
             gain[k] = mixed[:, nz] @ response[:, nz] / 2
             cost = cost - mixed.T @ response
         cost = (cost + cost.T) / 2
-        gains.append(_Gain(lift[m:], response))
+        gains.append(lift[m:, :nz] - lift[m:, m:] @ response[:, :nz])
     start_rows = _unit_end_rows(sweep.start_rows)
     _, sizes, right = np.linalg.svd(unit_rows(np.vstack([rows, start_rows]), tolerances.size))
     basis = right[int(np.sum(sizes > tolerances.size)) :].T
@@ -333,18 +333,6 @@ def _eliminate_controls(
     return results
 
 
-class _Gain(NamedTuple):
-    """Optimal linear feedback of a stage (mesh interval), from a state variation to the control variations."""
-
-    lift: np.ndarray
-    response: np.ndarray
-
-    def of(self, z: np.ndarray) -> np.ndarray:
-        """Return the optimal variations of the controls for a variation of the state."""
-        inputs = np.append(z, 0.0)
-        return np.asarray(self.lift @ np.concatenate([inputs, -self.response @ inputs]))
-
-
 def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
     """Return the rows of a matrix scaled to length 1, without rows that are zero up to a tolerance."""
     sizes = np.linalg.norm(rows, axis=1)
@@ -360,7 +348,7 @@ def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
 def _confirmed_negative(
     accessory: AccessoryProblem,
     sweep: _Linearised,
-    gains: list[_Gain],
+    gains: list[np.ndarray],
     curvature: tuple[float, float | None],
     *,
     first: int = 0,
@@ -387,7 +375,7 @@ def _confirmed_negative(
     cost, violations = float(z @ sweep.start_cost @ z), [0.0]
     for k in range(first, n):
         states[k] = z
-        values[k] = controls if controls is not None and k == first else gains[n - 1 - k].of(z)
+        values[k] = controls if controls is not None and k == first else gains[n - 1 - k] @ z
         inputs = np.concatenate([z, values[k]])
         cost += float(inputs @ stage[k] @ inputs)
         for j in range(k * q, (k + 1) * q):

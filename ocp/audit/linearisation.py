@@ -67,11 +67,9 @@ class Limits:
 
     def extend(self, count: int) -> None:
         """Append `count` equality constraints, which the plan satisfies exactly, to these limits."""
-        m = len(self.below)
-        self.equal = np.append(self.equal, np.ones(count, bool))
-        zeros = np.zeros((m, count))
-        self.below, self.above, self.gap = (np.hstack([part, zeros]) for part in (self.below, self.above, self.gap))
-        self.lower, self.upper = (np.hstack([part, np.ones((m, count), bool)]) for part in (self.lower, self.upper))
+        self.equal = np.pad(self.equal, (0, count), constant_values=True)
+        for name, value in (("below", 0.0), ("above", 0.0), ("gap", 0.0), ("lower", True), ("upper", True)):
+            setattr(self, name, np.pad(getattr(self, name), ((0, 0), (0, count)), constant_values=value))
 
     @property
     def near(self) -> np.ndarray:

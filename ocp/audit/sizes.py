@@ -235,10 +235,8 @@ def _constraint_sizes(
     nearest = np.minimum(1.0, nearest_bound(_select(bounds, rows.bounds)))
     threshold, is_constant = np.where(moves, 0.0, STANDSTILL), ~moves & (largest > STANDSTILL)
     for name in rows.names:
-        own_rows = rows.of(name)
-        size[own_rows] = _raise_to_floor(size[own_rows], is_constant[own_rows], nearest[own_rows], threshold[own_rows])[
-            0
-        ]
+        own = rows.of(name)
+        size[own], _ = _raise_to_floor(*(part[own] for part in (size, is_constant, nearest, threshold)))
     return np.asarray(size)
 
 

@@ -52,7 +52,7 @@ def distances_along(
     scene: CollisionScene,
     base: Array,
     joints: Array,
-    times: Array,
+    times: Array | float,
     *,
     cutoff: float = np.inf,
     pairs: Sequence[int] | None = None,
@@ -62,7 +62,7 @@ def distances_along(
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
     Args:
-        base, joints, times: Samples of the motion; one base (base_size,) is enough if it does not move.
+        base, joints, times: Samples of the motion; a base (base_size,) or a time that all samples share is enough.
         cutoff: For pairs farther apart than this, m, a lower bound of at least `cutoff` may be returned.
         pairs: Indices of the only pairs that count; the distances of the others are infinite. All if None.
     """

@@ -333,11 +333,9 @@ class _CellPass:
             cone_violations = kinematics.equations.cone_violations(times, layer.base, layer.joints)
             valid &= cone_violations.max(axis=1, initial=0.0) <= REACH_TOLERANCE
         if self.request.clearance_constraints is not None and valid.any():
-            scene, rows = self.request.clearance_constraints.scene, np.flatnonzero(valid)
-            distances = distances_along(
-                scene, layer.base[rows], layer.joints[rows], times[rows], cutoff=scene.clearance
-            )
-            valid[rows] = (distances >= scene.clearance).all(axis=1)
+            scene, states = self.request.clearance_constraints.scene, (layer.base[valid], layer.joints[valid])
+            distances = distances_along(scene, *states, layer.time, cutoff=scene.clearance)
+            valid[valid] = (distances >= scene.clearance).all(axis=1)
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:

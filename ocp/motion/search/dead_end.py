@@ -256,12 +256,9 @@ class _Propagation:
             displacement = np.abs(joints - self.joints[k - 1][parents])
             valid &= (displacement <= search.limits[k - 1] + TOLERANCE).all(axis=1)
         if search.scene is not None:
-            better = clearances > self.clearance[k][charts]
-            valid &= better
-            checked = np.flatnonzero(valid)
-            times = np.full(len(checked), search.times[k])
-            distances = distances_along(search.scene, np.zeros(0), joints[checked], times, cutoff=required).min(axis=1)
-            clearances[checked] = np.minimum(np.minimum(clearances[checked], distances), required)
+            valid &= clearances > self.clearance[k][charts]
+            distances = distances_along(search.scene, np.zeros(0), joints[valid], search.times[k], cutoff=required)
+            clearances[valid] = np.minimum(np.minimum(clearances[valid], distances.min(axis=1)), required)
         valid &= clearances > self.clearance[k][charts]
         rows = charts[valid]
         for recorded, values in ((self.joints, joints), (self.clearance, clearances), (self.parent, parents)):
@@ -292,8 +289,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     limits = search.limits[last] if last >= 0 else np.full(n, np.inf)
     distances = np.full((len(targets), 1), np.inf)
     if scene is not None:
-        times = np.full(len(targets), search.times[next_sample])
-        distances = distances_along(scene, np.zeros(0), targets, times, cutoff=clearance)
+        distances = distances_along(scene, np.zeros(0), targets, search.times[next_sample], cutoff=clearance)
     displacements = np.abs(targets - before)
     over, under = targets - space.upper, space.lower - targets
     excess = np.column_stack([pose_errors, over, under, displacements - limits, clearance - distances])

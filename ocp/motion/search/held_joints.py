@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 from warnings import warn
 
@@ -295,11 +296,7 @@ def restore_error(error: Error, request: PlanRequest) -> Error:
     """Return an error in which configurations have been extended by the positions of the joints held at rest."""
     if request.whole is None:
         return error
-    robot = request.whole.robot
-
-    def restore(joints: Array) -> Array:
-        return all_joints(robot, request.held, joints)
-
+    restore = partial(all_joints, request.whole.robot, request.held)
     if isinstance(error, Unreachable):
         error.joints = restore(error.joints)
     if isinstance(error, DeadEnd):

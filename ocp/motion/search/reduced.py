@@ -74,20 +74,17 @@ class TaskKinematics(NamedTuple):
 
     def task_rates(self, rates: Array) -> Array:
         """Return the rates of the task coordinates (K, m) that scaled joint rates (K, n) cause."""
-        rates_of_tasks: Array = self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
-        return rates_of_tasks[:, :, 0]
+        return np.asarray(self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None]))[:, :, 0]
 
     def least_rates(self, required: Array) -> Array:
         """Return the least-norm scaled joint rates (K, n) that cause required rates of the task coordinates (K, m)."""
         if not required.shape[1]:
             return np.zeros(self.null.shape[:2])
-        solutions: Array = self.row_space @ np.linalg.solve(self.lower, required[:, :, None])
-        return solutions[:, :, 0]
+        return np.asarray(self.row_space @ np.linalg.solve(self.lower, required[:, :, None]))[:, :, 0]
 
     def null_rates(self, rates: Array) -> Array:
         """Project scaled joint rates (K, n) onto the null space of the tasks."""
-        projected: Array = self.row_space @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
-        return np.asarray(rates - projected[:, :, 0])
+        return np.asarray(rates - (self.row_space @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None]))[:, :, 0])
 
     def base_rates(self, rates: Array) -> Array:
         """Return the base rates (K, b) that scaled joint rates (K, n) cause, without the drift at zero joint rates."""

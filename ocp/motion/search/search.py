@@ -163,8 +163,7 @@ class AtlasSearch:
         scene, free = self.scene, np.ones(len(charts), dtype=bool)
         if scene is None:
             return free
-        times = np.full(len(charts), self.times[k])
-        distances = distances_along(scene, np.zeros(0), charts.centers, times, cutoff=scene.clearance)
+        distances = distances_along(scene, np.zeros(0), charts.centers, self.times[k], cutoff=scene.clearance)
         at, pair = np.nonzero(distances < scene.clearance)
         box = charts.tangents, np.maximum(np.abs(charts.low), np.abs(charts.high)), charts.max_deviation
         largest = distances[at, pair] + largest_changes(scene, charts.centers, at, pair, box=box)
@@ -448,10 +447,8 @@ class AtlasSearch:
         """Return which configurations (N, n) of a time sample satisfy joint limits and clearance. Shape (N,)."""
         valid, scene = self.space.within(joints), self.scene
         if scene is not None:
-            rows = np.flatnonzero(valid)
-            times = np.full(len(rows), self.times[k])
-            distances = distances_along(scene, np.zeros(0), joints[rows], times, cutoff=scene.clearance)
-            valid[rows] = (distances >= scene.clearance).all(axis=1)
+            distances = distances_along(scene, np.zeros(0), joints[valid], self.times[k], cutoff=scene.clearance)
+            valid[valid] = (distances >= scene.clearance).all(axis=1)
         return valid
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:

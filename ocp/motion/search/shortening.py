@@ -335,24 +335,24 @@ class _LocalProgram:
         self._limits = self._limit_rows()
         violation = np.maximum(self._limits.value, 0.0)  # a slack relaxes each limit by its violation
         count, size = len(self._groups), self._basis.shape[1]
-        rows = np.arange(count + len(violation))
-        columns = np.append(size + self._groups, np.full(len(violation), size + len(numbers)))
-        values = np.append(-np.ones(count), -violation)
-        shape = len(rows), size + len(numbers) + 1
-        all_rows = scipy.sparse.vstack([self._pieces.gradient, self._limits.gradient]).tocsr() @ self._basis
-        all_rows.resize(shape)
-        matrix = all_rows + scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
+        members = np.ones(count), (np.arange(count), self._groups)
+        self._members = scipy.sparse.csr_array(members, shape=(count, len(numbers)))
+        blocks = [
+            [self._pieces.gradient @ self._basis, -self._members, None],
+            [self._limits.gradient @ self._basis, None, scipy.sparse.coo_array(-violation[:, None])],
+        ]
         penalty = PROGRAM.penalty * self._weight * float(violation.sum())
         objective = np.concatenate([self._basis.T @ self._fixed, np.ones(len(numbers)), [penalty]])
-        ranges = np.full((shape[1], 2), (-np.inf, np.inf))
+        ranges = np.full((len(objective), 2), (-np.inf, np.inf))
         ranges[:size], ranges[-1] = (-radius, radius), (0.0, 1.0)
         right = -np.append(self._pieces.value, self._limits.value)
+        matrix = scipy.sparse.block_array(blocks, format="csr")
         self._solution = scipy.optimize.linprog(objective, matrix, right, bounds=ranges, method="highs")
-        present, solved = np.full(len(numbers), -np.inf), self._solution.status == 0
-        np.maximum.at(present, self._groups, self._pieces.value)
-        self.saved = float(present.sum()) + penalty - float(self._solution.fun) if solved else 0.0
-        self.displacement = np.zeros(path.shape)
-        if solved:
+        self.saved, self.displacement = 0.0, np.zeros(path.shape)
+        if self._solution.status == 0:
+            present = np.full(len(numbers), -np.inf)
+            np.maximum.at(present, self._groups, self._pieces.value)
+            self.saved = float(present.sum()) + penalty - float(self._solution.fun)
             self.displacement = (self._basis @ self._solution.x[:size]).reshape(path.shape)
 
     def _step_gradients(self, k: Indices, joint: Indices, factor: Array) -> Any:
@@ -408,13 +408,8 @@ class _LocalProgram:
         at_clearance = pressures[len(pressures) - len(self._contacts) :] > PROGRAM.active * self._weight
         curvature[np.unique(self._contacts[at_clearance])] -= PROGRAM.contact * np.eye(r)
         # the pieces of a kink differ from their mean, weighted by the multipliers, only off the kink
-        mean = (
-            scipy.sparse.csr_array(
-                (shares, (self._groups, np.arange(count))), shape=(self._groups.max(initial=-1) + 1, count)
-            )
-            @ pieces
-        )
-        kinks = (pieces - mean[self._groups])[np.flatnonzero(shares > PROGRAM.active)]
+        mean = self._members.T @ (scipy.sparse.diags_array(shares) @ pieces)
+        kinks = (pieces - self._members @ mean)[np.flatnonzero(shares > PROGRAM.active)]
         active = limits[np.flatnonzero(pressures > PROGRAM.active * self._weight)]
         kept = scipy.sparse.vstack([kinks / self._weight, active]).tocsr() @ self._basis
         square = PROGRAM.stiffness * (kept.T @ kept) + scipy.sparse.block_diag([*curvature])

@@ -456,10 +456,8 @@ class _ToolLevers:
 
     def distances(self, positions: Array, rotations: Array) -> Array:
         """Return displacements of the points, m, and rotations, rad, between successive tip poses (M, 3), (M, 3, 3)."""
-        places = [positions + rotations @ point for point in self.points]
-        return np.column_stack(
-            [*(np.linalg.norm(np.diff(each, axis=0), axis=1) for each in places), _angles(rotations)]
-        )
+        steps = [np.diff(positions + rotations @ point, axis=0) for point in self.points]
+        return np.column_stack([*np.linalg.norm(steps, axis=2), _angles(rotations)])
 
     def task_distances(self, task: TipTask, times: Array) -> Array:
         """Return tool displacements and rotations that a task prescribes between times (M,) after its start."""
