@@ -89,21 +89,13 @@ def corrected_motion(along: Linearisation) -> IntegratedMotion | None:
     if not along.finite:
         return None
     newton = _Newton(along)
-    continuous = newton.converged(True)
-    if continuous is None:
+    if (continuous := newton.converged(True)) is None:
         return None
-    by_interval = newton.converged(False, continuous.rate)
-    if by_interval is None:
+    states, cost, rate = continuous
+    if (by_interval := newton.converged(False, rate)) is None:
         return None
-    return IntegratedMotion(by_interval.x[:, ::2], continuous.x[:, ::2], by_interval.cost, continuous.cost)
-
-
-class _Converged(NamedTuple):
-    """States of the re-integrated motion, its running cost, and the convergence rate of the corrections."""
-
-    x: np.ndarray
-    cost: float
-    rate: float
+    local, local_cost, _ = by_interval
+    return IntegratedMotion(local[:, ::2], states[:, ::2], local_cost, cost)
 
 
 class _Newton:
@@ -138,12 +130,12 @@ class _Newton:
         self.carried = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         self.transition = np.eye(nx) + (along.weight[:, None, None] * (self.feed @ self.carried)).sum(axis=1)
         self.first = self._integral(self.x)
-        self.own = None if self.first is None else self._own_error(self.first, self.x)
 
-    def _integral(self, x: np.ndarray) -> np.ndarray | None:
+    def _integral(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Integrate state rates and running cost at given states ``x`` from the start of each interval to all samples.
 
-        Shape (N, 2 cells + 1, nx + 1). None if the quadrature error exceeds the tolerance.
+        Also return the error of the states that arises inside each interval. Shapes (N, 2 cells + 1, nx + 1), (N,
+        2 cells + 1, nx). None if the quadrature error exceeds the tolerance.
         """
         check_time()
         form, (n, samples) = self.along.form, x.shape[:2]
@@ -154,7 +146,10 @@ class _Newton:
         panels = _panels(flow)
         doubt = np.abs(panels @ self.doubt).max(axis=1).reshape(n, -1, flow.shape[2]).max(axis=1)
         allowed = len(INNER) * SETTINGS.tolerance * self.unit + SETTINGS.rounding * self.largest
-        return self._cumulative(panels, flow.shape) if (doubt <= allowed).all() else None
+        if not (doubt <= allowed).all():
+            return None
+        integral = self._cumulative(panels, flow.shape)
+        return integral, self._own_error(integral, x)
 
     def _cumulative(self, panels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         """Integrate sampled rates, arranged by ``_panels``, from the start of each interval to every sample.
@@ -168,17 +163,20 @@ class _Newton:
         integral[:, 1:] = parts.reshape(n, samples - 1, m)
         return integral
 
-    def converged(self, chained: bool, rate: float = 1.0) -> _Converged | None:
+    def converged(self, chained: bool, rate: float = 1.0) -> tuple[np.ndarray, float, float] | None:
         """Correct the states of the plan until they satisfy its dynamics; None if the corrections do not converge.
+
+        Return the states, their running cost, and the ratio of successive corrections.
 
         Args:
             chained: Whether one motion starts from the plan's first state, not a separate motion in every interval.
             rate: Ratio of successive corrections, as far as it is known.
         """
-        nx, x, integral, error, last = self.along.form.nx, self.x, self.first, self.own, np.inf
+        nx, x, current, last = self.along.form.nx, self.x, self.first, np.inf
         for _ in range(SETTINGS.corrections):
-            if integral is None or error is None:
+            if current is None:
                 break
+            integral, error = current
             change = error + self._propagate(error[:, -1], x) if chained else error
             size = float(np.abs(change).reshape(-1, nx).max(axis=0) @ (1 / self.unit[:nx]))
             if not size < SETTINGS.contraction * last:
@@ -186,9 +184,8 @@ class _Newton:
             rate = size / last if np.isfinite(last) else rate
             x = x + change
             if rate * size <= SETTINGS.remainder:
-                return _Converged(x, float(integral[:, -1, nx].sum()) + self._cost_change(change), rate)
-            integral, last = self._integral(x), size
-            error = None if integral is None else self._own_error(integral, x)
+                return x, float(integral[:, -1, nx].sum()) + self._cost_change(change), rate
+            current, last = self._integral(x), size
         return None
 
     def _cost_change(self, change: np.ndarray) -> float:

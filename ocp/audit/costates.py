@@ -248,7 +248,7 @@ def _state_limit_multipliers(
     )
     # density of each multiplier: that at a Gauss point, at the end, or at the start of the interval
     densities = back.ahead.T / weight[:, None], np.array([np.zeros(q), np.ones(q)])
-    places, directions, shares, prices, free = [], [], [], [], []
+    unknowns = []
     for (values, limit, slope_x), density in zip(kinds, densities, strict=True):
         is_atom = values is atoms
         for active, gap, sign in limit.sides:
@@ -257,13 +257,12 @@ def _state_limit_multipliers(
                 # one unknown per equality, where the transcription imposes it
                 redundant = limit.equal[i] and (is_atom, j) != (True, 0) if along.nodal else limit.equal[i] and is_atom
                 if effect > 0 and not redundant:
-                    places.append((values, j, i, sign / effect))
-                    directions.append(sign * slope_x[j, i] / effect)
-                    shares.append(density[j])
-                    prices.append(gap[j, i] / effect)
-                    free.append(bool(limit.equal[i]))
-    if not places:
+                    place = values, j, i, sign / effect
+                    price = gap[j, i] / effect
+                    unknowns.append((place, sign * slope_x[j, i] / effect, density[j], price, bool(limit.equal[i])))
+    if not unknowns:
         return inside, atoms
+    places, directions, shares, prices, free = zip(*unknowns, strict=True)
     # costates at the Gauss points and at the start without multipliers, and their response to each multiplier
     ends = np.vstack([last, directions])
     known = np.concatenate([(last + back.drive[k])[None], np.array(shares)[:, :, None] * ends[1:, None]])

@@ -316,13 +316,9 @@ def _eliminate_controls(
     nonzero = lengths > tolerances.size * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
     rows = np.where(nonzero, rows / np.where(nonzero, lengths, 1.0), 0.0)
     left, sizes, right = np.linalg.svd(rows[:, :, nz:])
-    ranks, visible_ranks = (sizes > tolerances.size).sum(axis=1), (sizes > tolerances.seen).sum(axis=1)
-    by_rank: dict[tuple[int, int], list[int]] = {}
-    for k, kind in enumerate(zip(ranks.tolist(), visible_ranks.tolist(), strict=True)):
-        by_rank.setdefault(kind, []).append(k)
+    ranks = np.column_stack([(sizes > limit).sum(axis=1) for limit in tolerances])
     results = []
-    for (rank, visible), members in by_rank.items():
-        at = np.array(members)
+    for (rank, visible), at in groups(ranks):
         turned, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
         lift = np.zeros((len(at), size, size - rank))
         lift[:, :nz, :nz] = np.eye(nz)

@@ -323,18 +323,12 @@ def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.nda
     return y
 
 
-def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the distinct rows of a boolean array (M, m), each with the indices of all rows that equal it."""
-    if not patterns.size:
-        return [(np.zeros(patterns.shape[1], bool), np.arange(len(patterns)))] if len(patterns) else []
-    packed = np.ascontiguousarray(np.packbits(patterns, axis=1))
-    if (packed == packed[0]).all():
-        return [(patterns[0], np.arange(len(patterns)))]
-    keys = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
-    _, first, member = np.unique(keys, return_index=True, return_inverse=True)
-    order = np.argsort(member, kind="stable")
-    splits = np.searchsorted(member[order], np.arange(1, len(first)))
-    return list(zip(patterns[first], np.split(order, splits), strict=True))
+def groups(rows: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the distinct rows of an array (M, m), each with the indices of all rows that equal it."""
+    members: dict[bytes, list[int]] = {}
+    for k, row in enumerate(rows):
+        members.setdefault(row.tobytes(), []).append(k)
+    return [(rows[equal[0]], np.array(equal)) for equal in members.values()]
 
 
 def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:

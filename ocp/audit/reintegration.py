@@ -334,9 +334,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
         for name, place in pool.items():
             index = places[kind][place]
             low, high = lower[index], upper[index]
-            bounded = np.isfinite(low) | np.isfinite(high)
-            if kind in ("initial", "terminal"):
-                bounded = low == high
+            bounded = low == high if kind in ("initial", "terminal") else np.isfinite(low) | np.isfinite(high)
             if np.any(bounded):
                 excess = excess_over(values[at][:, place][:, bounded], low[bounded], high[bounded])
                 results.append(_violation_of(f"{description} {name}", name, grid.t[at], excess, size[place][bounded]))

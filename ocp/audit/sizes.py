@@ -177,9 +177,7 @@ def _sizes_of(
     """
     spread, largest = _spread(values)
     spread = np.where(free, largest, spread)
-    nonzero = np.zeros(spread.shape, dtype=bool)
-    for end in ends:
-        nonzero |= np.abs(np.nan_to_num(end)) > STANDSTILL
+    nonzero = (np.abs(np.nan_to_num(ends)) > STANDSTILL).any(axis=0)
     return _raise_to_floor(
         np.maximum(spread, SOLVER_SHARE * largest), nonzero, np.minimum(1.0, nearest_bound(declared))
     )

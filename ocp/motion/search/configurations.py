@@ -389,24 +389,12 @@ def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unrea
     return Unreachable(f"at {time:.4g} s{where}: {error}", **{**vars(error), "time": time})
 
 
-@dataclass(frozen=True)
-class ReachSettings:
-    """Settings of the search for the time at which tasks leave the reachable workspace.
-
-    Attributes:
-        intervals: Number of intervals at whose ends the reach is evaluated before the bisection.
-        bisections: Number of bisections of one interval.
-        tolerance: Pose error up to which a pose is within reach, m or rad: below the repeatability of arms.
-        continued: Number of solutions that are starts of inverse kinematics at the next time, before random starts.
-    """
-
-    intervals: int = 32
-    bisections: int = 24
-    tolerance: float = 1e-6
-    continued: int = 16
-
-
-REACH = ReachSettings()
+REACH_INTERVALS, REACH_BISECTIONS = 32, 24
+"""Numbers of intervals at whose ends the reach of tasks is evaluated, and of bisections of the interval of its end."""
+END_TOLERANCE = 1e-6
+"""Pose error up to which a pose is within reach, m or rad: below the repeatability of arms."""
+CONTINUED_SOLUTIONS = 16
+"""Number of solutions that are starts of inverse kinematics at the next time, before random starts."""
 
 
 @dataclass
@@ -423,7 +411,7 @@ class _Reach:
     def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
         """Solve inverse kinematics at a time and store the solutions; return an error if there is no solution."""
         targets = np.array(self._targets(time)).ravel()
-        options = {**self.options, "options": IkOptions(limits=limits, tolerance=REACH.tolerance)}
+        options = {**self.options, "options": IkOptions(limits=limits, tolerance=END_TOLERANCE)}
         for starts in (0, self.options["starts"]):
             if not starts and not len(self.solutions):
                 continue
@@ -433,7 +421,7 @@ class _Reach:
             except Unreachable as error:
                 unreachable = error
             else:
-                self.solutions = np.array([solution.joints for solution in solved[: REACH.continued]])
+                self.solutions = np.array([solution.joints for solution in solved[:CONTINUED_SOLUTIONS]])
                 return None
         return unreachable
 
@@ -466,7 +454,7 @@ def end_of_reach(
     """
     begin, end = interval
     reach = _Reach(bind(machine, tasks), {"starts": starts, "seed": seed}, np.zeros((0, machine.joint_size)))
-    grid = np.linspace(begin, end, REACH.intervals + 1)
+    grid = np.linspace(begin, end, REACH_INTERVALS + 1)
     within = begin
     for beyond in (*grid[grid < failed].tolist(), failed):
         if (miss := reach.unreachable_at(beyond, limits)) is not None:
@@ -475,7 +463,7 @@ def end_of_reach(
     else:
         return None
     first, nearest = beyond, miss
-    for _ in range(REACH.bisections if beyond > within else 0):
+    for _ in range(REACH_BISECTIONS if beyond > within else 0):
         middle = (within + beyond) / 2
         if (error := reach.unreachable_at(middle, limits)) is None:
             within = middle
@@ -487,7 +475,7 @@ def end_of_reach(
     details: dict[str, Any] = {"name": miss.name, "value": miss.pose_error}
     cause = f"no joint limit ends it, the arm is singular there with joints {np.round(nearest.joints, 6).tolist()}"
     free = _Reach(reach.equations, reach.options, np.vstack([reach.solutions, nearest.joints]))
-    if limits and free.unreachable_at(within + (first - within) / REACH.intervals, limits=False) is None:
+    if limits and free.unreachable_at(within + (first - within) / REACH_INTERVALS, limits=False) is None:
         cause, joint = _joint_at_limit(machine, nearest.joints)
         details |= joint
     words = f"the reach ends, {cause}; at {first:.4g} s the nearest miss is {describe_miss(miss.distance, miss.angle)}"

@@ -32,17 +32,10 @@ Span = tuple[int, int]
 """Indices of the first and the last time sample of a segment."""
 
 
-@dataclass(frozen=True)
-class SegmentSettings:
-    """Settings of the search for the lowest-cost division of a path into segments.
-
-    Attributes:
-        max_iterations: Largest number of divisions that are evaluated; then the best known one is taken.
-        gap: Relative cost reduction that must still be possible for the search to continue.
-    """
-
-    max_iterations: int = 40
-    gap: float = 0.005
+MAX_DIVISIONS = 40
+"""Largest number of divisions of a path into segments that are evaluated; then the best known one is taken."""
+DIVISION_GAP = 0.005
+"""Relative cost reduction by another division that must still be possible for the search to continue."""
 
 
 class Segment(NamedTuple):
@@ -63,7 +56,7 @@ class Segment(NamedTuple):
 
 
 def fewest_segments(
-    search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
+    search: AtlasSearch, gap: int = 1, barred: Collection[Span] = ()
 ) -> tuple[list[Segment], float] | None:
     """Cover all time samples by the fewest segments, at minimum cost; return the segments and a lower cost bound.
 
@@ -71,7 +64,6 @@ def fewest_segments(
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
             continuous time.
         barred: Spans of samples that are known to be infeasible in one segment, as is any span that contains them.
-        settings: Limits of the effort.
 
     Returns:
         None if the motion cannot be continued somewhere. With gap 1, a sample without a configuration is a segment of
@@ -92,10 +84,10 @@ def fewest_segments(
         costs = {span: np.inf if s is None else s.bound if bounds else s.cost for span, s in segments.items()}
         return _best_chain(*ranges, gap, (lower_bounds if bounded else {}) | costs)
 
-    for _ in range(settings.max_iterations):
+    for _ in range(MAX_DIVISIONS):
         chain, total = best_chain(True)
         missing = [span for span in chain if span not in segments]
-        if not missing or total >= (1 - settings.gap) * best_chain(False)[1]:
+        if not missing or total >= (1 - DIVISION_GAP) * best_chain(False)[1]:
             break
         segments |= {span: _solve_segment(search, *span) for span in missing}
     chain, total = best_chain(False)

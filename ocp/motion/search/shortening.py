@@ -184,37 +184,27 @@ class PathProblem:
         return at, distance - self.margin, gradient
 
 
-@dataclass(frozen=True)
-class ShorteningSettings:
-    """Settings of `shorten_path`, such as the number of neighbouring configurations that are tried.
-
-    Attributes:
-        neighbours: Number of configurations on either side of the path, by the dimension of the manifold.
-        max_moves: Largest number of iterations with one spacing.
-        least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
-    """
-
-    neighbours: tuple[int, int, int, int] = (0, 5, 2, 1)
-    max_moves: int = 10
-    least_gain: float = 1e-4
+NEIGHBOURS = {1: 5, 2: 2, 3: 1}
+"""Number of neighbouring configurations on either side of a path, by the dimension of the manifold."""
+MAX_MOVES = 10
+"""Largest number of iterations of the dynamic programming with one spacing of the neighbours."""
+LEAST_GAIN = 1e-4
+"""Relative cost reduction below which the spacing is reduced even if the path runs along the edge of the neighbours."""
 
 
-def shorten_path(
-    path: Array, problem: PathProblem, widths: tuple[float, float], settings: ShorteningSettings = ShorteningSettings()
-) -> Array:
+def shorten_path(path: Array, problem: PathProblem, widths: tuple[float, float]) -> Array:
     """Return a path near the given path that has a lower cost or smaller violations of limits. Shape (K, n).
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
         problem: Manifolds, all of one dimension from one to three (others leave the path unchanged), steps and limits.
         widths: Initial and final spacing of the configurations, in the metric.
-        settings: Settings of the dynamic programming.
     """
     joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
     steps, dimension, tangents = problem.steps, problem.dimension, None
-    if dimension not in (1, 2, 3):
+    if dimension not in NEIGHBOURS:
         return path
-    count_per_side = settings.neighbours[dimension]
+    count_per_side = NEIGHBOURS[dimension]
     shifts = np.array(list(product(np.arange(-count_per_side, count_per_side + 1.0), repeat=dimension)))
     while width > finest:
         tangents = problem.tangents(joints, tangents)
@@ -226,11 +216,8 @@ def shorten_path(
         for k in range(1, len(joints)):
             displacements = candidates[k][None] - candidates[k - 1][:, None]
             excess = np.maximum(np.abs(displacements) - steps.limits[k - 1], 0.0).sum(axis=2)
-            costs = (
-                values[:, None]
-                + steps.cost.evaluate(displacements, steps.times[k] - steps.times[k - 1])
-                + PENALTY * excess
-            )
+            step_costs = steps.cost.evaluate(displacements, steps.times[k] - steps.times[k - 1])
+            costs = values[:, None] + step_costs + PENALTY * excess
             back_pointers.append(costs.argmin(axis=0))
             values = costs.min(axis=0) + PENALTY * violations[k]
         choice = [int(values.argmin())]
@@ -239,7 +226,7 @@ def shorten_path(
         joints = candidates[np.arange(len(joints)), choice[::-1]]
         at_edge, current_cost = np.abs(shifts[choice]).max() == count_per_side, float(values.min())
         moves += 1
-        if not (at_edge and current_cost < best_cost * (1 - settings.least_gain) and moves < settings.max_moves):
+        if not (at_edge and current_cost < best_cost * (1 - LEAST_GAIN) and moves < MAX_MOVES):
             width, moves = width / 2, 0
         best_cost = min(best_cost, current_cost)
     return joints
@@ -424,7 +411,7 @@ class _LocalProgram:
         return False
 
 
-def optimise_path(path: Array, problem: PathProblem, settings: ProgramSettings = PROGRAM) -> Array:
+def optimise_path(path: Array, problem: PathProblem) -> Array:
     """Return a locally optimal path (K, n) near a given path, by a sequence of linear programs.
 
     It costs no more than the given path and violates no limit by more. The time limit ends the sequence early.
@@ -433,38 +420,37 @@ def optimise_path(path: Array, problem: PathProblem, settings: ProgramSettings =
         path: Configurations that do the tasks at the samples. Shape (K, n).
         problem: Manifolds, all of the same dimension (others leave the path unchanged), steps and limits. The cost of
             steps is the weighted sum, or the largest, of the joint displacements.
-        settings: Settings of the linear programs.
     """
     if not problem.dimension or len(path) < 2:
         return path
-    first_violation, penalty = problem.violation(path), settings.penalty * float(problem.weights.max())
-    best, merit, radius = path, problem.cost(path) + penalty * first_violation, settings.first
+    first_violation, penalty = problem.violation(path), PROGRAM.penalty * float(problem.weights.max())
+    best, merit, radius = path, problem.cost(path) + penalty * first_violation, PROGRAM.first
     tangents = problem.tangents(path, None)
-    for _ in range(settings.most_programs):
-        if radius < settings.smallest or time_left() <= 0:
+    for _ in range(PROGRAM.most_programs):
+        if radius < PROGRAM.smallest or time_left() <= 0:
             break
         program = _LocalProgram(problem, best, tangents, radius)
-        if program.saved <= settings.least_gain * merit:
+        if program.saved <= PROGRAM.least_gain * merit:
             break
         moved, converged = problem.project((best + program.displacement)[:, None])
         moved_merit = problem.cost(moved[:, 0]) + penalty * problem.violation(moved[:, 0])
         share = (merit - moved_merit) / program.saved if converged.all() else 0.0
-        if share >= settings.accepted:
+        if share >= PROGRAM.accepted:
             best, merit = moved[:, 0], moved_merit
             tangents = problem.tangents(best, tangents)
-        if share >= settings.trusted:
-            radius = min(settings.growth * radius, settings.largest)
-        elif not share >= settings.distrusted:
-            radius *= settings.shrinkage
+        if share >= PROGRAM.trusted:
+            radius = min(PROGRAM.growth * radius, PROGRAM.largest)
+        elif not share >= PROGRAM.distrusted:
+            radius *= PROGRAM.shrinkage
     return best if problem.violation(best) <= max(first_violation, TOLERANCE) else path
 
 
-def optimality_of(path: Array, problem: PathProblem, settings: ProgramSettings = PROGRAM) -> tuple[float, bool]:
+def optimality_of(path: Array, problem: PathProblem) -> tuple[float, bool]:
     """Return the cost that small displacements of a path (K, n) save, and whether they may save more to second order.
 
-    The displacements are at most `settings.checked`; the saved cost is a first-order estimate.
+    The displacements are at most `PROGRAM.checked`; the saved cost is a first-order estimate.
     """
     if not problem.dimension or len(path) < 2:
         return 0.0, False
-    program = _LocalProgram(problem, path, problem.tangents(path, None), settings.checked)
+    program = _LocalProgram(problem, path, problem.tangents(path, None), PROGRAM.checked)
     return max(program.saved, 0.0), program.decreases_to_second_order()

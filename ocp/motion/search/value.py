@@ -15,7 +15,7 @@ order for lengths, whose bounds are affine.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -31,37 +31,20 @@ from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, S
 Indices = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class GraphSettings:
-    """Settings of the graph of charts of the self-motion manifold.
-
-    Attributes:
-        successors: Number of charts that are tried as the next one after a configuration.
-        pairs: Approximate number of neighbouring charts that are processed together, limited by memory.
-        sample: Number of charts from which the number of neighbours is estimated.
-        tangents, refinements: Numbers of tangent planes that tighten the bound of a step over a box, and of iterations
-            towards each. Fewer give looser bounds, so that charts are split that could be discarded.
-    """
-
-    successors: int = 8
-    pairs: int = 200_000
-    sample: int = 64
-    tangents: int = 2
-    refinements: int = 3
+MAX_SUCCESSORS = 8
+"""Number of charts that are tried as the next one after a configuration."""
+BATCH_PAIRS, SAMPLED_CHARTS = 200_000, 64
+"""Approximate number of pairs of neighbouring charts that are processed together, limited by memory, and number of
+charts from which the number of neighbours is estimated."""
+TANGENTS, REFINEMENTS = 2, 3
+"""Numbers of tangent planes that tighten the bound of a step over a box, and of iterations towards each. Fewer give
+looser bounds, so that charts are split that could be discarded."""
 
 
 class ChartGraph:
     """Layered graph whose nodes are the manifold charts at all time samples, and whose edges are possible steps."""
 
-    def __init__(
-        self,
-        space: JointSpace,
-        layers: list[Charts],
-        steps: Steps,
-        max_costs: Array,
-        *,
-        settings: GraphSettings = GraphSettings(),
-    ) -> None:
+    def __init__(self, space: JointSpace, layers: list[Charts], steps: Steps, max_costs: Array) -> None:
         """Create the graph of charts of the self-motion manifold and possible steps between them.
 
         Args:
@@ -69,11 +52,10 @@ class ChartGraph:
             layers: Charts of each time sample.
             steps: Steps between the samples.
             max_costs: Largest cost of a step. Shape (K - 1,).
-            settings: Settings of the graph.
         """
         self.space, self.layers, self.seconds = space, layers, np.diff(steps.times)
         self.cost, self.limits = steps.cost, steps.limits
-        self.max_costs, self.settings = max_costs, settings
+        self.max_costs = max_costs
 
     @cached_property
     def curved(self) -> list[CurvedCharts]:
@@ -123,10 +105,10 @@ class ChartGraph:
         reach = min(self.cost.reach(max_cost, float(self.seconds[between])), float(self.space.length(limit)))
         reach = min(reach, MAX_STEP)
         tree = self.space.tree(target.centers)
-        sample = self.space.tree(source.centers[:: max(len(source) // self.settings.sample, 1)])
+        sample = self.space.tree(source.centers[:: max(len(source) // SAMPLED_CHARTS, 1)])
         radius = min(reach + float(sizes[0].max() + sizes[1].max()), MAX_STEP)
         mean_count = sample.count_neighbors(tree, radius) / sample.n
-        batch = max(16, int(self.settings.pairs / max(mean_count, 1.0)))
+        batch = max(16, int(BATCH_PAIRS / max(mean_count, 1.0)))
         columns = [np.ascontiguousarray(rows.T) for rows in (source.centers, target.centers, *spans)]
         for first in range(0, len(source), batch):
             rows = np.arange(first, min(first + batch, len(source)))
@@ -162,7 +144,7 @@ class ChartGraph:
             return
         candidates = charts.select(rows)
         costs, places = self.cost.minimal_steps(delta[rows], candidates, after.select(rows), seconds)
-        for i in np.argsort(costs, kind="stable")[: self.settings.successors].tolist():
+        for i in np.argsort(costs, kind="stable")[:MAX_SUCCESSORS].tolist():
             yield replace(candidates.select([i]), centers=joints + delta[rows[[i]]]), places[i]
 
     def _sweep(
@@ -228,7 +210,7 @@ class ChartGraph:
             if not i.size:
                 continue
             starts = np.flatnonzero(np.diff(i, prepend=-1))
-            parts = _bound_charts(steps, source.select(i), starts, max_cost - known_costs[i[starts]], self.settings)
+            parts = _bound_charts(steps, source.select(i), starts, max_cost - known_costs[i[starts]])
             parts = self._raise_to_floor(parts, source.select(i[starts]), floor[i[starts]])
             for whole, part in zip(bounds, parts, strict=True):
                 whole[i[starts]] = part
@@ -268,9 +250,7 @@ def _least_of_groups(values: Array, groups: Indices) -> Array:
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
 
-def _bound_charts(
-    steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
-) -> QuadraticBounds:
+def _bound_charts(steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array) -> QuadraticBounds:
     """Combine the cost bounds of all steps that start in the same manifold chart into one bound for each chart.
 
     The steps of a chart are consecutive and begin at `starts`. Values above `max_costs` (M,) need not be resolved.
@@ -296,12 +276,12 @@ def _bound_charts(
     lowest, *tangents = (part[best_place, rows] for part in (places, values, slopes))
     best = _tangent_bounds(lowest, tangents, curves, common, tilt)
     least = best.minimum(charts.low, charts.high)[0]
-    for _ in range(settings.tangents):  # only steps that may determine the minimum of their chart
+    for _ in range(TANGENTS):  # only steps that may determine the minimum of their chart
         undecided = np.flatnonzero(least[rows] < upper[rows])
         rows, best = rows[undecided], best.select(undecided)
         remaining, boxes, curvature = steps.select(rows), charts.select(rows), common[rows]
         place = best.minimum(boxes.low, boxes.high)[1]
-        for _ in range(settings.refinements):
+        for _ in range(REFINEMENTS):
             place = remaining.descend(place, tilt[rows], curvature)
         tangent = _tangent_bounds(place, remaining.at(place), curves[rows], curvature, tilt[rows])
         best, least[rows] = _best_combination(best, least[rows], tangent, boxes)

@@ -20,7 +20,7 @@ from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.lengths import LargestMotion, PathLength
 from ocp.motion.search.search import AtlasSearch, SearchSettings
 from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, SquaredRates, StepCost, Steps, least_in_box
-from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
+from ocp.motion.search.value import _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
 from tests.families import some
 from tests.ocp.motion.search.test_charts import planar
@@ -349,11 +349,7 @@ def test_bounds_on_a_chart_are_below_all_steps_from_it(kind: Any, free: int, mon
         delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
     )
     starts = np.arange(0, count, each)
-    result, boxes, gaps = (
-        _bound_charts(steps, out, starts, np.full(groups, np.inf), GraphSettings()),
-        out.select(starts),
-        [],
-    )
+    result, boxes, gaps = (_bound_charts(steps, out, starts, np.full(groups, np.inf)), out.select(starts), [])
     rest = QuadraticBounds(
         rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1))
     )
