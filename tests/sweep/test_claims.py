@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from pathlib import Path
 
@@ -84,6 +85,10 @@ def test_the_page_of_bounds_has_the_gaps_and_times_of_the_rows() -> None:
         assert claimed("docs/theory/bound.md", pattern) == [*counts, min(gaps), max(gaps), min(times), max(times)]
         largest = rf"exceeded the bound by .*?at most ([\d.]+) % with {redundant}"
         assert claimed("docs/tutorials/waypoints.md", largest) == [max(gaps)]
+    excess = max(row["cost"] / row["best"] - 1 for row in rows if "best" in row)
+    assert claimed("docs/theory/bound.md", r"cost over ([\d.]+) % more than the best") == [
+        math.ceil(1e5 * excess) / 1e3
+    ]
 
 
 def test_the_page_of_waypoints_has_the_lengths_and_gaps_of_the_rows() -> None:
