@@ -10,7 +10,7 @@ Kim and Kim 2011, for any machine on a fixed or floating base and any tasks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -220,7 +220,4 @@ def _attach_guess(
             options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "weights": weights}
             motions.append(track_tasks(stretch.equations, at, place, times, damping=damping, **options))
         place, at = motions[-1].base[:, -1], motions[-1].joints[:, -1]
-    declared = motion.problem.declared
-    for name, guess in motion.guess(motions, 0).items():
-        pool = declared.states if name in declared.states else declared.controls
-        pool[name] = replace(pool[name], guess=guess)
+    motion.problem.declared.set_guesses(motion.guess(motions, 0))

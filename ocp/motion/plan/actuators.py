@@ -329,7 +329,6 @@ def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> 
             "jerks": _slopes(accelerations, times.reshape(shape)),
         }
         named = {name + stretch.suffix: values for name, values in values_by_name.items()}
-        for name, values in {**named, CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}.items():
-            for pool in (motion.problem.declared.states, motion.problem.declared.controls):
-                if values is not None and (variable := pool.get(name)) is not None:
-                    pool[variable.name] = replace(variable, guess=Samples(fractions * motion.horizon, values))
+        named |= {CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}
+        guesses = {name: Samples(fractions * motion.horizon, each) for name, each in named.items() if each is not None}
+        motion.problem.declared.set_guesses(guesses)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -24,7 +25,7 @@ from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
 from ocp.motion.builders.dynamics_plan import barrier_options
 from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
-from ocp.motion.local.collisions import Collision
+from ocp.motion.local.collisions import Collision, find_collisions
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import solve_with_accelerations
@@ -404,7 +405,7 @@ class CandidateSolver(Solver):
         if self._collisions[0] is not solution:
             collisions = list[Collision]()
             for sample in self._motion_samples(solution):
-                collisions += constraints.find_collisions(sample.base, sample.joints, sample.t)
+                collisions += find_collisions(constraints.scene, sample.base, sample.joints, sample.t)
             worst: dict[int, Collision] = {}
             for collision in sorted(collisions, key=lambda collision: collision.distance):
                 worst.setdefault(collision.pair, collision)
@@ -418,11 +419,10 @@ class CandidateSolver(Solver):
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
         """Return the collisions along the local (resolved-rate) motion of an initial guess, in order of severity."""
-        constraints, collisions = self.request.clearance_constraints, list[Collision]()
-        for motion in seed.local if constraints is not None else ():
-            assert constraints is not None
-            collisions += constraints.find_collisions(motion.base[0], motion.joints[0], motion.t)
-        return sorted(collisions, key=lambda collision: collision.distance)
+        if (constraints := self.request.clearance_constraints) is None:
+            return []
+        found = (find_collisions(constraints.scene, each.base[0], each.joints[0], each.t) for each in seed.local)
+        return sorted(chain.from_iterable(found), key=attrgetter("distance"))
 
     @property
     def no_clear_configuration(self) -> bool:

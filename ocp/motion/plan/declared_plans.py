@@ -75,7 +75,7 @@ def plan_sequence(
         SolveError: No motion satisfies its limits.
     """
     motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
-    state, joints, base = Start.of_known(options.start, motors)
+    state, joints, base = Start.of(options.start, motors, known=True)
     own_limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     cost = None if options.cost is None else require.instance("cost", options.cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
@@ -134,7 +134,7 @@ def _goal_request(
     machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> GoalRequest:
     """Check the arguments of a motion to one goal, and return them as a request."""
-    state, joints, _ = Start.of_known(options.start, machine)
+    state, joints, _ = Start.of(options.start, machine, known=True)
     limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     is_free = isinstance(horizon, str)
     if is_free:
@@ -171,7 +171,7 @@ def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPl
     if not isinstance(machine, Stance) or machine.robot.joint_names != stance.robot.joint_names:
         words = "steps begin in their first stance: give plan(steps.stances[0], steps, start=...)"
         raise ProblemError(words, name="machine", value=machine)
-    joints = Start.of_known(options.start, stance)[1]
+    joints = Start.of(options.start, stance, known=True)[1]
     begin = steps.in_order(stance, joints[None])[0]
     return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=options.cost, limits=options.limits), joints)
 
@@ -188,7 +188,7 @@ def plan_capture(
     chaser = require.instance("machine", machine, FreeFloating)
     setup: dict[str, Any] = {"cost": options.cost, "limits": options.limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=options.start, **setup)
-    return _plan_of_phases(chaser, solution, Start.of_known(options.start, chaser)[1])
+    return _plan_of_phases(chaser, solution, Start.of(options.start, chaser, known=True)[1])
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:

@@ -102,8 +102,8 @@ class _Sequence:
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        start_of = Start.of_known if isinstance(self.parts[0], Goal) else Start.of
-        start, joints, base = start_of(self.options.start, self.machine)
+        known = isinstance(self.parts[0], Goal)
+        start, joints, base = Start.of(self.options.start, self.machine, known=known)
         self.state = _Junction(joints, base, start.velocity)
 
     @property

@@ -246,13 +246,12 @@ class _WaypointPlanner:
             self.machine,
             best.joints,
             self.limits,
-            best.cost,
             self.constraints,
             self.poses,
+            self.cost,
             tuple(candidates),
             lower_bound or None,
             best.breaks,
-            self.cost,
         )
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------

@@ -302,7 +302,8 @@ def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
     for joint in chain:
         rate, revolute = float(rate_limits[machine.robot.joint_names.index(joint.name)]), joint.kind != "prismatic"
-        linear += rate * (_chain_length(machine, after[joint.name]) if revolute else 1.0)
+        length = chain_length(after[joint.name], machine.robot.tip_translation) if revolute else 1.0
+        linear += rate * length
         angular += rate if revolute else 0.0
     return linear, angular
 
@@ -319,10 +320,12 @@ def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
     return np.linalg.norm(linear, axis=0), np.linalg.norm(angular, axis=0)
 
 
-def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
-    """Return an upper bound of the length of a joint chain to the tip, m, with prismatic joints fully extended."""
-    length = float(np.linalg.norm(machine.robot.tip_translation))
-    length += sum(float(np.linalg.norm(joint.translation)) for joint in joints)
+def chain_length(joints: Sequence[Joint], point: Any) -> float:
+    """Return an upper bound of the distance, m, from the start of a joint chain to a point (3,) of its last link.
+
+    It is infinite if a prismatic joint has no limits.
+    """
+    length = sum(float(np.linalg.norm(offset)) for offset in (point, *(joint.translation for joint in joints)))
     return length + sum(max(abs(joint.lower), abs(joint.upper)) for joint in joints if joint.kind == "prismatic")
 
 
@@ -337,7 +340,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
         shoulder, rotation = shoulder + rotation @ joint.translation, rotation @ joint.rotation
     slides = [joint for joint in chain[: first + 1] if joint.kind == "prismatic"]
     slide_length = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
-    return shoulder, slide_length + _chain_length(machine, chain[first + 1 :])
+    return shoulder, slide_length + chain_length(chain[first + 1 :], robot.tip_translation)
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
