@@ -64,11 +64,7 @@ class CandidateSolver(Solver):
     """
 
     def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
-        """Prepare the solver for the candidates of a request.
-
-        Args:
-            start, reference: As in `tool_motion_problem`.
-        """
+        """Prepare the solver for the candidates of a request; start and reference are those of `ToolMotionSetup`."""
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
         self.turning = request.turning_joints
         constraints = request.clearance_constraints
@@ -421,8 +417,8 @@ class CandidateSolver(Solver):
         """Return the collisions along the local (resolved-rate) motion of an initial guess, in order of severity."""
         if (constraints := self.request.clearance_constraints) is None:
             return []
-        found = (find_collisions(constraints.scene, each.base[0], each.joints[0], each.t) for each in seed.local)
-        return sorted(chain.from_iterable(found), key=attrgetter("distance"))
+        of_motions = (find_collisions(constraints.scene, each.base[0], each.joints[0], each.t) for each in seed.local)
+        return sorted(chain.from_iterable(of_motions), key=attrgetter("distance"))
 
     @property
     def no_clear_configuration(self) -> bool:

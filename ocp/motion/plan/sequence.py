@@ -74,12 +74,8 @@ def plan_consecutive(
 ) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
-    Args:
-        machine: Machine on a fixed or floating base.
-        parts: Goals and tasks in their order. Tasks that are done at once form a sequence of their own.
-        options: Options that all motions share; the start may be None if the first motion is along a task.
-        scene: As in `plan`.
-        free: Whether the planner chooses the durations.
+    Tasks that are done at once form a sequence of their own. The start may be None if the first motion is along a task.
+    `free` is whether the planner chooses the durations.
 
     Raises:
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
@@ -267,14 +263,8 @@ def plan_in_segments(
     divided at time samples, refined to a thousandth of the horizon where that may save a segment. Among divisions into
     the fewest segments, the one whose segments cost least is chosen; reconfigurations cost nothing.
 
-    Args:
-        machine: An arm on a fixed base.
-        tasks, horizon, options: As in `plan`; the tasks are poses that leave at most two degrees of freedom
-            undetermined. Actuator limits do not influence the division, but the segments are planned within them.
-        scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
-
-    Returns:
-        The segments and reconfigurations, with a lower bound of their number.
+    The tasks are poses that leave at most two degrees of freedom undetermined. Actuator limits do not influence the
+    division, but the segments are planned within them. Obstacles are static, since a reconfiguration takes time.
 
     Raises:
         ProblemError: As in `plan`; or an obstacle moves.

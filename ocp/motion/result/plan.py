@@ -6,8 +6,6 @@ waypoints (`path_plan`), or several plans one after the other (`segmented_plan`)
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from abc import ABC, abstractmethod
@@ -370,12 +368,9 @@ class Plan(ABC):
 
     def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
         """Write the `table` of the motion, with a row every `period` s, to a CSV file in full precision."""
-        columns = self.table(period)
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(table_head(self.names))
-        writer.writerows([repr(value) for value in row] for row in np.column_stack([*columns.values()]).tolist())
-        write_text(path, stream.getvalue())
+        rows = np.column_stack([*self.table(period).values()]).tolist()
+        lines = (table_head(self.names), *(map(repr, row) for row in rows))
+        write_text(path, "".join(f"{','.join(line)}\n" for line in lines))
 
     def to_ros(self, period: float = 0.01) -> dict[str, Any]:
         """Return the fields of trajectory_msgs/msg/JointTrajectory as a dictionary, sampled every `period` s."""

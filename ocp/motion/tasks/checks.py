@@ -69,13 +69,16 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     return positions, base_values
 
 
-def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
+def clip_to_limits(
+    machine: Machine, joints: Array, lower: Array, upper: Array, *, label: str, hint: str = "keep within them"
+) -> Array:
     """Clip joint positions or velocities (n,), nan where free, that exceed limits by no more than rounding errors.
 
     Raises:
         ProblemError: A joint is outside its limits; `label` names the values, and `hint` says what to do.
     """
-    for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
+    limits = joints.tolist(), lower.tolist(), upper.tolist()
+    for name, value, low, high in zip(machine.robot.joint_names, *limits, strict=True):
         size = high - low if np.isfinite(high - low) else max([1.0, *(abs(x) for x in (low, high) if np.isfinite(x))])
         if value < low - CHECKS.rounding * size or value > high + CHECKS.rounding * size:
             at, least, greatest = format_distinct(value, low, high)
@@ -291,8 +294,8 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
             if speeds[worst] > limit * (1 + CHECKS.closed):
                 words = f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, but "
                 words += f"joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
-                details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
-                raise ProblemError(words, name=part.name, **details)
+                speed, time = float(speeds[worst]), float(times[worst])
+                raise ProblemError(words, name=part.name, value=speed, limit=limit, time=time)
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:

@@ -122,8 +122,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a zero moment point rule constrains: inward normals n
-    (k, 2) and offsets o (k,), with n . point >= o inside.
+    """Return the edges of the region that a zero moment point rule allows: inward normals n (k, 2) and offsets o (k,),
+    with n . point >= o inside. Where a rule prescribes the point, they are those of the support in other directions.
     """
     normals = machine.support.normals
     offsets = (normals * machine.support.vertices).sum(axis=1)
@@ -131,17 +131,20 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
         return normals, offsets + zmp.margin
     open_edges = np.zeros(len(offsets), dtype=bool)
     if isinstance(zmp, IndexAtLeast):
-        corners = np.array(np.meshgrid(*np.transpose(zmp.region(machine)))).reshape(2, 4)
+        low, high = zmp.region(machine)
+        corners = np.array(np.meshgrid(*np.transpose([low, high]))).reshape(2, 4)
         open_edges = (normals @ corners).min(axis=1) < offsets
-    elif isinstance(zmp, Pinned | Following):
+        sides = np.vstack([np.eye(2), -np.eye(2)])
+        return np.vstack([sides, normals[open_edges]]), np.concatenate([low, -high, offsets[open_edges]])
+    if isinstance(zmp, Pinned | Following):
         directions = machine.moving_directions
         open_edges = np.abs(normals - normals @ directions.T @ directions).max(axis=1) > PARALLEL
     return normals[open_edges], offsets[open_edges]
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances (k, 1), m, of a zero moment point (2, 1) from the support edges, without the constant ones.
-    Raise ProblemError if a constant distance is negative. `external` states whether external wrenches act.
+    """Return the distances (k, 1), m, of a zero moment point (2, 1) from `foot_edges`, without the constant ones. Raise
+    ProblemError if a constant distance is negative. `external` states whether external wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
     movable = np.abs(normals @ machine.moving_directions.T).max(axis=1, initial=0.0) > PARALLEL
@@ -151,25 +154,10 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
     for i in set(range(len(offsets))) - set(free):
         inside = float(ca.evalf(rows[i])) if external else float(normals[i] @ reachable - offsets[i])
         if inside < -ROUNDING_M:
-            words = f"the zero moment point is {-inside:.4g} m beyond an edge of the support, less its margin, in "
+            words = f"the zero moment point is {-inside:.4g} m outside the region that {type(zmp).__name__} allows, in "
             words += "every motion of the joints: move the foot below the machine"
             raise ProblemError(words, name="zero moment point", value=-inside, limit=0.0)
     return rows[free]
-
-
-def constrained_axes(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0: x, 1: y) of the zero moment point that are not constant, so that constraints must keep
-    them in the rectangle of `zmp`; raise ProblemError if a constant coordinate is outside of the rectangle.
-    """
-    rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
-    low, high = zmp.region(machine)
-    reachable = machine.nearest_reachable(machine.most_stable_point)
-    for i in {0, 1} - set(rows):
-        if not low[i] - ROUNDING_M <= reachable[i] <= high[i] + ROUNDING_M:
-            words = f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {reachable[i]:.4g} m in "
-            words += f"every motion, outside {low[i]:.4g} .. {high[i]:.4g} m: move the foot below the machine"
-            raise ProblemError(words, name="zero moment point", value=reachable[i], limit=(low[i], high[i]))
-    return rows
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:

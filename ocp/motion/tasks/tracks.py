@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import ModelError
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, real
@@ -60,14 +61,11 @@ def pose_line(
     require.choice("pace", pace, ("constant", "rest"))
     require.positive("duration", duration)
     (rotation, origin), (turned, end) = (_pose(pose, name) for pose, name in ((first, "first"), (second, "second")))
-    change = rotation.T @ turned
-    axial = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
-    sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(change)) - 1) / 2
-    angle = float(np.arctan2(sine, cosine))
+    vector = scipy.spatial.transform.Rotation.from_matrix(rotation.T @ turned).as_rotvec()
+    angle = float(np.linalg.norm(vector))
     if angle > MAX_ROTATION_RAD:
         words = f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous"
         raise ProblemError(words, name="poses", value=angle, limit=MAX_ROTATION_RAD)
-    vector = axial / 2 * (angle / sine if sine > 0 else 1.0)
 
     def fraction(time: Any) -> Any:
         s = time / duration

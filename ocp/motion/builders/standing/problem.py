@@ -36,14 +36,12 @@ from ocp.motion.tasks.checks import check_length, check_rest, checked_configurat
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import (
     Following,
-    IndexAtLeast,
     InFoot,
     JointBounds,
     Limits,
     Pinned,
     ZmpRule,
     check_rule,
-    constrained_axes,
     foot_rows,
     is_finite,
 )
@@ -157,9 +155,9 @@ def standing_problem(
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
     0, and the control "path_acceleration". The path constraints are "tip", see `StandingSetup.tip_level`; "zero moment
-    point", m, with InFoot the distance from the edges of the foot less the margin; "foot", the distance from edges that
-    another rule leaves open, m; "vertical force", N; "friction", squared friction limit less squared tangential force,
-    over the squared weight; and "torques". The guess is a local motion.
+    point", the distance from the edges of the region that `zmp` allows, or from a point that it prescribes, m; "foot",
+    the distance from other edges of the foot then, m; "vertical force", N; "friction", squared friction limit less
+    squared tangential force, over the squared weight; and "torques". The guess is a local motion.
 
     Args:
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
@@ -357,13 +355,11 @@ def _constrain_ground(
         reserve = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
         problem.path("friction", reserve, lower=0)
     point = center_of_pressure(reaction)
-    if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
-        rows = constrained_axes(machine, zmp, point, bool(wrenches))
-        problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows], unit="m")
-    elif isinstance(zmp, Pinned | Following):
+    name = "zero moment point"
+    if isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
-        problem.path("zero moment point", gap, lower=0, upper=0, unit="m")
+        problem.path(name, gap, lower=0, upper=0, unit="m")
+        name = "foot"
     inside = foot_rows(machine, zmp, point, bool(wrenches))
     if inside.numel():
-        problem.path("zero moment point" if isinstance(zmp, InFoot) else "foot", inside, lower=0, unit="m")
+        problem.path(name, inside, lower=0, unit="m")
