@@ -104,18 +104,14 @@ class CandidateSolver(Solver):
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
         """Return whether the tasks must be relaxed, because their Jacobian is nearly singular on a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
-        return self._can_relax and any(sample.is_nearly_singular for sample in samples)
-
-    @property
-    def _can_relax(self) -> bool:
-        return self.request.time_cost is None
+        return self.request.time_cost is None and any(sample.is_nearly_singular for sample in samples)
 
     def _may_relax(self, candidate: Candidate) -> bool:
         """Return whether relaxed tasks may save a rejected candidate; they cannot resolve collisions."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
-        return self._can_relax and seed.thorough and not seed.relaxed
+        return self.request.time_cost is None and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
         """Return why a candidate failed: violations by its guess or, if tasks are relaxed, by its last iterate."""

@@ -70,18 +70,18 @@ def plan_consecutive(
     options: PlanOptions,
     *,
     scene: Scene | Literal[False] | None,
-    free: bool,
+    horizon: Literal["free"] | None,
 ) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
     Tasks that are done at once form a sequence of their own. The start may be None if the first motion is along a task.
-    `free` is whether the planner chooses the durations.
+    The tasks and goals state their durations unless the horizon is "free".
 
     Raises:
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
         SolveError: A part has no motion; names the part.
     """
-    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, free).plan()
+    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, horizon).plan()
 
 
 @dataclass(eq=False)
@@ -92,7 +92,7 @@ class _Sequence:
     parts: tuple[Any, ...]
     options: PlanOptions
     scene: Scene | Literal[False] | None
-    free: bool
+    horizon: Literal["free"] | None
     state: _Junction = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -101,11 +101,6 @@ class _Sequence:
         known = isinstance(self.parts[0], Goal)
         start, joints, base = Start.of(self.options.start, self.machine, known=known)
         self.state = _Junction(joints, base, start.velocity)
-
-    @property
-    def horizon(self) -> Literal["free"] | None:
-        """Horizon of each motion of the sequence: "free", or None if its tasks or its goal state the duration."""
-        return "free" if self.free else None
 
     @property
     def smooth(self) -> bool:

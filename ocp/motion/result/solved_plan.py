@@ -16,6 +16,7 @@ from models import Machine
 from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.audit.audit import Audit
+from ocp.curves import gauss_points
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, ERRORS, PACE, SLOPES, START_ERRORS
 from ocp.motion.result.candidate import Candidate
@@ -43,13 +44,10 @@ class Part(NamedTuple):
 
 def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
     """Return the part of the cost of a solution by which relaxed tasks limit the deviations from their targets."""
-    breaks = solution.control_interpolant.breaks
-    points, weights = np.polynomial.legendre.leggauss(len(solution.control_interpolant.nodes))
-    widths = np.diff(breaks)
-    fractions = breaks[:-1, None] + widths[:, None] * (points + 1) / 2
-    shares = (widths[:, None] * weights / 2).ravel()
+    curve = solution.control_interpolant
+    fractions, shares = (each.ravel() for each in gauss_points(curve.breaks, len(curve.nodes)))
     errors = {part.suffix: part.end - part.begin for part in parts if f"{ERRORS}{part.suffix}" in solution.controls}
-    sample = solution.at_fraction(np.clip(fractions.ravel(), 0.0, 1.0)) if errors else {}
+    sample = solution.at_fraction(np.clip(fractions, 0.0, 1.0)) if errors else {}
     total = sum(seconds * shares @ (sample[f"{ERRORS}{suffix}"] ** 2).sum(axis=1) for suffix, seconds in errors.items())
     starts = (values[-1] for name, values in solution.states.items() if name.startswith(START_ERRORS))
     return float(total + sum((values**2).sum() for values in starts)) / 2

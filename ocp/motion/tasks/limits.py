@@ -22,11 +22,6 @@ ROUNDING_M = 1e-9
 REFERENCE_SAMPLES = 201  # number of times at which a reference is checked
 
 
-def is_finite(value: Any) -> bool:
-    """Return whether a value is a single finite number."""
-    return bool(np.isfinite(real(value)))
-
-
 @dataclass(frozen=True)
 class InFoot:
     """Rule that the zero moment point stays inside the support polygon by a margin (m) of at least 0."""
@@ -56,7 +51,7 @@ class IndexAtLeast:
     value: float
 
     def __post_init__(self) -> None:
-        if not (is_finite(self.value) and self.value < 1):
+        if not (np.isfinite(real(self.value)) and self.value < 1):
             words = f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()"
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models.checks import Array
+from models.checks import Array, real
 from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
 from models.robot.dynamics import Wrench
 from models.robot.kinematics import joint_limit_index
@@ -34,17 +34,7 @@ from ocp.motion.builders.standing.start import (
 )
 from ocp.motion.tasks.checks import check_length, check_rest, checked_configuration, checked_tasks, rates_at_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import (
-    Following,
-    InFoot,
-    JointBounds,
-    Limits,
-    Pinned,
-    ZmpRule,
-    check_rule,
-    foot_rows,
-    is_finite,
-)
+from ocp.motion.tasks.limits import Following, InFoot, JointBounds, Limits, Pinned, ZmpRule, check_rule, foot_rows
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
@@ -132,7 +122,7 @@ class FreeTime:
 
     def __post_init__(self) -> None:
         times = (self.lower, self.guess, self.upper)
-        if not (all(map(is_finite, times)) and 0 < self.lower <= self.guess <= self.upper):
+        if not (np.isfinite([*map(real, times)]).all() and 0 < self.lower <= self.guess <= self.upper):
             message = "FreeTime: 0 < lower <= guess <= upper is needed, not " + ", ".join(map(repr, times))
             raise ProblemError(message, name="FreeTime", value=times)
 
