@@ -60,15 +60,10 @@ def plan_sequence(
 ) -> PhasedPlan:
     """Plan motions to consecutive goals as the phases of one problem, which minimises their total cost.
 
-    A pose is reached in the configuration that is nearest to the goal before it.
-
-    Args:
-        machine: Arm on a fixed or floating base; each goal may have its own, with the same joints.
-        goals: The goals, each with a duration in s, or FreeTime(...).
-        total: Duration of all of them together, s, if some are free; None leaves it free.
-        options: Start, which is required; cost, the squared torques if None; limits, beside which the robot's own
-            torque limits hold; and seed.
-        constraints: Clearance constraints, or None.
+    A pose is reached in the configuration that is nearest to the goal before it. Each goal has a duration in s, or
+    FreeTime(...), and may have its own machine with the same joints. `total` is the duration of all of them together,
+    s, if some are free; None leaves it free. The cost is that of the squared torques by default, and the robot's own
+    torque limits hold beside the limits of the options.
 
     Raises:
         ProblemError: As `dynamics_phases`; or the start is missing.

@@ -179,11 +179,7 @@ class Candidate:
 
     @classmethod
     def of_record(cls, record: Sequence[Any], solution: Solution | None) -> Candidate:
-        """Rebuild a candidate from the data of a plan file; `solution` is its motion unless the candidate was rejected.
-
-        Args:
-            record: As `record` returns it; it is not trusted.
-            solution: Motion of the plan.
+        """Rebuild a candidate from a `record` that is not trusted; `solution` is its motion unless it was rejected.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.

@@ -341,9 +341,7 @@ def _distance_requirements(plan: Plan) -> list[Requirements]:
 def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> list[Requirements]:
     """Return the requirements on torques, powers and the ground reaction in one part of a plan.
 
-    Args:
-        machine: Machine that moves in this part, with its load.
-        part: The part. Its joints are those of the first machine of the plan, in any order.
+    `machine` is the one that moves in this part, with its load; its joints are those of the plan, in any order.
     """
     if isinstance(machine, Stance) or machine.robot.total_mass == 0:
         return []

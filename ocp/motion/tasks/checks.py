@@ -100,11 +100,8 @@ def checked_tasks(
 ) -> None:
     """Raise ProblemError if the machine cannot perform the tasks, or if its tip is not at a task's target at the start.
 
-    Args:
-        equations: Equations of the tasks.
-        base, joints: Start configuration.
-        horizon: End of the tasks, s; 1 for tasks of a path parameter.
-        check_start: Whether the pose at the start is checked.
+    The horizon is the end of the tasks, s, or 1 for tasks of a path parameter. Without `check_start`, the poses at the
+    start are not compared.
     """
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
     rows = _equation_numbers(equations)

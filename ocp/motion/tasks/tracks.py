@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from models import ModelError
-from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, real
+from models.checks import NOT_NUMBERS, Array, ArrayInput, real
 from models.paths.blends import rest_to_rest
 from models.paths.smooth_path import SmoothPath, exponential, path_function, turn_function
 from models.spatial import expression, rotation_from_quaternion
@@ -218,17 +218,12 @@ def track_expression(
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
     value = _call_track(track, time - begin if begin else time, label) if callable(track) else track
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = list(value.ravel())
-    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
-        value = ca.vertcat(*value)
     expected = " or ".join(map(str, allowed))
-    if not isinstance(value, ca.SX | ca.MX | ca.DM):
-        try:
-            value = ca.DM(floats(value))
-        except NOT_NUMBERS as error:
-            words = f"{label} gives {value!r}, not numbers or expressions of shape {expected}"
-            raise ProblemError(words, name=label, value=value, limit=allowed) from error
+    try:
+        value = expression(value)
+    except ModelError as error:
+        words = f"{label} gives {value!r}, not numbers or expressions of shape {expected}"
+        raise ProblemError(words, name=label, value=value, limit=allowed) from error
     if value.shape not in allowed:
         hint = ": one entry for each row of the task" if label == "velocity" else ""
         words = f"{label} has shape {tuple(value.shape)}, expected {expected}{hint}"

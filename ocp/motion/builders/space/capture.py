@@ -83,11 +83,7 @@ class Cone:
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a constraint function of a tip position, m, that is positive inside the cone. Shape (1, 1).
-
-        Args:
-            place: Position of the tip in the grasped frame. Shape (3, 1), m.
-        """
+        """Return a constraint function, positive inside the cone, of a tip position (3, 1) in the grasped frame, m."""
         from_apex = place + self.depth * ca.DM(self.direction)
         share = ca.fmin(ca.fmax((ca.sumsqr(place) / self.length**2 - 1) / 3, 0), 1)
         opened = share**2 * (3 - 2 * share)
