@@ -123,7 +123,7 @@ def _demand(
 
 
 def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> Reason | None:
-    """Return the most exceeded limit of joints whose motion the tasks determine; None if they exceed none.
+    """Return the most exceeded limit of joints whose motion the tasks determine; None if no limit is exceeded.
 
     The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
     moves at a random configuration is not moved at almost all configurations: the tasks determine its motion. Divided

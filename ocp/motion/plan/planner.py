@@ -122,8 +122,8 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
     """Return candidates with local (resolved-rate) motions as guesses, those that satisfy the tasks first, by cost.
 
-    The cost includes that of the approach from the configuration `near` of the request. `motions` are K local motions
-    through each time interval, `options` further fields of `Seed`.
+    The cost includes the cost of the approach from the configuration `near` of the request. `motions` are K local
+    motions through each time interval, `options` further fields of `Seed`.
     """
     errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
     approaches = _approach_costs(solver.request, motions[0].joints[:, 0])

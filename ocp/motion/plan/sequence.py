@@ -66,11 +66,11 @@ def _junction_velocity(rates: Array, smooth: bool) -> Any:
 
 def plan_consecutive(
     machine: Machine,
-    parts: Sequence[Goal | TipTask | Sequence[TipTask]],
+    tasks: Sequence[Goal | TipTask | Sequence[TipTask]],
+    horizon: Literal["free"] | None,
     options: PlanOptions,
     *,
     scene: Scene | Literal[False] | None,
-    horizon: Literal["free"] | None,
 ) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
@@ -81,7 +81,7 @@ def plan_consecutive(
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
         SolveError: A part has no motion; names the part.
     """
-    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, horizon).plan()
+    return _Sequence(checked_motors("plan", machine), tuple(tasks), horizon, options, scene).plan()
 
 
 @dataclass(eq=False)
@@ -90,9 +90,9 @@ class _Sequence:
 
     machine: Machine
     parts: tuple[Any, ...]
+    horizon: Literal["free"] | None
     options: PlanOptions
     scene: Scene | Literal[False] | None
-    horizon: Literal["free"] | None
     state: _Junction = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)

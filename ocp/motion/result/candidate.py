@@ -211,7 +211,7 @@ class Candidate:
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return candidates as a plan lists them, the lowest-cost one that passed first, then by rising cost.
+    """Return finished candidates: first the lowest-cost candidate that passed, then the others by rising cost.
 
     Other candidates that passed are rejected, because they cost more. The data of intermediate stages are left out.
     """

@@ -43,7 +43,7 @@ class Part(NamedTuple):
 
 
 def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
-    """Return the part of the cost of a solution by which relaxed tasks limit the deviations from their targets."""
+    """Return the part of a solution's cost that penalises deviations of relaxed tasks from their targets."""
     curve = solution.control_interpolant
     fractions, shares = (each.ravel() for each in gauss_points(curve.breaks, len(curve.nodes)))
     errors = {part.suffix: part.end - part.begin for part in parts if f"{ERRORS}{part.suffix}" in solution.controls}

@@ -285,7 +285,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if self.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return p, L: the integral of a squared derivative is |L c|^2 / T^p (c: control points, T: duration)."""
+        """Return p, L such that |L c|^2 / T^p is an integrated squared derivative (control points c, duration T)."""
         at, shares = (each.ravel() for each in gauss_points(self.breaks, self.degree - order + 1))
         basis = scipy.sparse.diags_array(np.sqrt(shares)) @ self._values(at, order)
         joints = scipy.sparse.diags_array(np.sqrt(self.squares[order - 1]))

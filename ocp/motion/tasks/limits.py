@@ -138,8 +138,8 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances (k, 1), m, of a zero moment point (2, 1) from `foot_edges`, without the constant ones. Raise
-    ProblemError if a constant distance is negative. `external` states whether external wrenches act.
+    """Return those distances (k, 1), m, of a zero moment point (2, 1) from `foot_edges` that are not constant.
+    Raise ProblemError if a constant distance is negative. `external` states whether external wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
     movable = np.abs(normals @ machine.moving_directions.T).max(axis=1, initial=0.0) > PARALLEL
