@@ -85,6 +85,13 @@ def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
     return np.asarray(matrix)
 
 
+def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points and weights of Gauss quadrature, ``count`` in each of K intervals. Shape (K, count) each."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    half = np.diff(breaks)[:, None] / 2
+    return breaks[:-1, None] + half * (points + 1), half * weights
+
+
 def quadrature_weights(points: np.ndarray) -> np.ndarray:
     """Return the interpolatory quadrature weights of d ``points`` for integrals over 0..1. Shape (d,)."""
     gauss, weight = np.polynomial.legendre.leggauss(len(points))

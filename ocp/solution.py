@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ocp.console import interruptible
-from ocp.curves import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial, gauss_points
 from ocp.errors import AuditError, ProblemError, SolverStatus, StorageWarning, values_within
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import parts_of_phase
@@ -239,12 +239,9 @@ class Solution:
             parts[kind] = replace(curve, values=curve.values[:, :, np.repeat(np.array(columns, bool), sizes)])
         phase = self.problem.declared.phases[name]
         grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
-        places, weights = np.polynomial.legendre.leggauss(8)
-        at = (grid[:-1, None] + np.diff(grid)[:, None] * (places + 1) / 2).ravel()
-        density = self._sample([phase.running], at)[0].reshape(-1, len(places))
-        cost = float(density @ weights @ np.diff(grid)) / 2 + float(
-            self._sample([phase.terminal], np.ones(1))[0].item()
-        )
+        at, shares = gauss_points(grid, 8)
+        density = self._sample([phase.running], at.ravel())[0].reshape(at.shape)
+        cost = float((density * shares).sum()) + float(self._sample([phase.terminal], np.ones(1))[0].item())
         return replace(
             self,
             name=f"{self.name}: {name}",

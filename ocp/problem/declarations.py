@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -170,6 +171,11 @@ class Declarations:
     horizon: Horizon | None = None
     running: Any = None
     terminal: Any = None
+
+    def set_guesses(self, guesses: Mapping[str, Any]) -> None:
+        """Replace the initial guesses of states and controls by those of the same name; other names are ignored."""
+        for pool in (self.states, self.controls):
+            pool.update({name: replace(pool[name], guess=guess) for name, guess in guesses.items() if name in pool})
 
     def check_new_variable(self, kind: str, name: Any) -> None:
         """Raise ProblemError if a new variable's name is invalid, reserved or used; messages begin with ``kind``."""

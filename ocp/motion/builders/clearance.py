@@ -21,7 +21,7 @@ from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
 from ocp.errors import ProblemError, SolveError, problem_errors, require
-from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
+from ocp.motion.local.collisions import Collision, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import Separation, frames_of
 from ocp.problem.problem import Problem
@@ -134,10 +134,6 @@ class ClearanceConstraints:
             distances = _evaluate(partial(scene.distances, pairs=pairs, rounding=ROUNDING), *at)
             least = [scene.clearance + self.margins[pair] for pair in pairs]
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
-
-    def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """Return the pairs of bodies that come closer than the clearance at samples of a motion, sorted by distance."""
-        return find_collisions(self.scene, base, joints, times)
 
 
 def clearance_of(

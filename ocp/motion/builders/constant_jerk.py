@@ -25,7 +25,7 @@ import scipy
 
 from models import FixedBase
 from models.checks import Array
-from ocp.curves import PiecewisePolynomial
+from ocp.curves import PiecewisePolynomial, gauss_points
 from ocp.errors import SolveError, SolverStatus
 from ocp.motion.builders.dynamics import joint_torques
 from ocp.motion.tasks.limits import JointBounds
@@ -153,9 +153,7 @@ class ConstantJerkMotion:
         control_curve = PiecewisePolynomial(breaks, np.array([0.5]), constant[:, None])
         costate_curve = PiecewisePolynomial(breaks, NODES, np.zeros_like(states))
         p = form.parameter_vector({})
-        nodes, weights = np.polynomial.legendre.leggauss(5)
-        at = (breaks[:-1, None] + np.diff(breaks)[:, None] * (nodes + 1) / 2).ravel()
-        shares = (np.diff(breaks)[:, None] * weights / 2).ravel()
+        at, shares = (each.ravel() for each in gauss_points(breaks, 5))
         running = form.sampled([form.running], state_curve(at), control_curve(at), at * horizon, horizon, p)[0][:, 0]
         final = form.terminal_cost(states[-1, -1], states[0, 0], constant[0], horizon=horizon, p=p)
         cost = float(horizon * shares @ running + final)

@@ -23,10 +23,11 @@ from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configurat
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
 from models.shapes.distance import soft_minimum
-from models.spatial import FULL_TURN, expression
+from models.spatial import FULL_TURN
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, problem_errors, require
+from ocp.motion.tasks.tracks import track_expression
 from ocp.problem.problem import Problem
 
 Targets = Callable[[Any], Any]
@@ -196,7 +197,8 @@ def roll_problem(
             violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)
     time = symbols.sym("time")
-    rows = np.array(ca.Function("target", [time], [_target_at(targets, time)]).map(len(t))(t[None]))
+    target_at = track_expression(targets, time, (5, 1), label="targets")
+    rows = np.array(ca.Function("target", [time], [target_at]).map(len(t))(t[None]))
     status = np.array(optimal_inverse(rig, tunnel, settings.branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         first = int(np.flatnonzero(status)[0])
@@ -205,16 +207,12 @@ def roll_problem(
     price = ca.Function(
         "price", [x, phi], [ca.cse(index + ca.fmin(proximity, SEARCH.price) + SEARCH.price * violation)]
     )
-    rolls = least_cost_roll(
-        lambda times, values: np.asarray(np.array(price.map(len(values))(rows[:, times], values[None]))[0]),
-        t,
-        lower=rig.limit(6, False),
-        upper=rig.limit(6, True),
-        first_roll=start_roll,
-        rate_weight=settings.rate_weight,
-        acceleration_weight=settings.acceleration_weight,
-        rate_limit=settings.rate_limit,
-    )
+
+    def price_at(times: Array, values: Array) -> Array:
+        return np.asarray(np.array(price.map(len(values))(rows[:, times], values[None]))[0])
+
+    limits = rig.limit(6, False), rig.limit(6, True)
+    rolls = least_cost_roll(price_at, t, limits, first_roll=start_roll, settings=settings)
     start, speed = Samples(t, rolls[:, None]), Samples(t, np.gradient(rolls, t)[:, None])
 
     problem = Problem("roll plan", symbols=symbols)
@@ -224,7 +222,7 @@ def roll_problem(
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, acceleration)
-    target = _target_at(targets, problem.time)
+    target = track_expression(targets, problem.time, (5, 1), label="targets")
 
     def along(name: str, value: Any) -> Any:
         """Replace the symbols of target and roll in an expression by the problem's target over time and its roll."""
@@ -242,38 +240,13 @@ def roll_problem(
     return problem
 
 
-def _target_at(targets: Targets, time: Any) -> Any:
-    """Return the tool target (5, 1) of a user's function at a symbolic time; raise ProblemError if it is invalid."""
-    try:
-        target = expression(targets(time))
-    except RuntimeError:  # interpolants do not take SX symbols
-        raise
-    except Exception as error:  # raised by the user's function
-        words = f"roll_problem: targets must be a function of time that gives (5,), not {targets!r}: {error!r}"
-        raise ProblemError(words, name="targets", value=targets) from error
-    symbols = [] if isinstance(target, ca.DM) else ca.symvar(target)
-    foreign = [str(symbol) for symbol in symbols if not ca.is_equal(symbol, time, 1)]
-    if target.shape != (5, 1) or foreign or (isinstance(target, ca.DM) and not target.is_regular()):
-        words = f"roll_problem: targets gives {target}, not five finite numbers or expressions of the time"
-        raise ProblemError(words, name="targets", value=str(target), limit=(5, 1))
-    return target
-
-
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
     """Return by how much the values of an expression exceed lower and upper bounds, summed over the values."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
 def least_cost_roll(
-    cost: Any,
-    t: Array,
-    *,
-    lower: float,
-    upper: float,
-    first_roll: float | None,
-    rate_weight: float,
-    acceleration_weight: float,
-    rate_limit: float,
+    cost: Any, t: Array, limits: tuple[float, float], *, first_roll: float | None, settings: RollSettings
 ) -> Array:
     """Return the rig's roll, rad, at equally spaced times (samples,) with the least integral of cost and squared rate.
 
@@ -282,6 +255,7 @@ def least_cost_roll(
     rate with which a change of roll in its optimal time costs the same. Without limits all rolls of a turn are
     searched, and the roll may wind. The first grid may exceed the rate limit by one step.
     """
+    (lower, upper), rate_weight, rate_limit = limits, settings.rate_weight, settings.rate_limit
     count, about = len(t), float(np.clip(0.0, lower, upper)) if first_roll is None else first_roll
     step = FULL_TURN / SEARCH.rolls
     circle = not np.isfinite([lower, upper]).any()
@@ -292,9 +266,10 @@ def least_cost_roll(
         rolls = np.linspace(first, last, int(np.ceil((last - first) / step)) + 1) if first < last else np.array([about])
     table = cost(np.repeat(np.arange(count), len(rolls)), np.tile(rolls, count)).reshape(count, -1)
     gain = float(np.median(np.median(table, axis=1) - table.min(axis=1)))  # gain of the best roll over a typical one
-    span = min(t[-1] - t[0], (36 * acceleration_weight / max(gain, 1e-12)) ** 0.25)  # minimises gain span + 12 v/span^3
+    longest = (36 * settings.acceleration_weight / max(gain, 1e-12)) ** 0.25  # minimises gain span + 12 v/span^3
+    span = min(t[-1] - t[0], longest)
     if span > 0:
-        rate_weight += 12 * acceleration_weight / span**2
+        rate_weight += 12 * settings.acceleration_weight / span**2
     if first_roll is not None:
         table[0, np.arange(len(rolls)) != int(np.abs(rolls - about).argmin())] = np.inf
     # a slow roll needs a coarse grid of times, else a grid step exceeds the rate limit

@@ -369,13 +369,13 @@ class _Ends:
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
         n, hint = machine.joint_size, "keep within them, or leave that end free: nan"
-        words: dict[str, Any] = {"names": machine.robot.joint_names, "hint": hint}
         first, last = (
-            clip_to_limits(_checked_end(name, value, n), bounds.lower, bounds.upper, label=name, **words)
+            clip_to_limits(machine, _checked_end(name, value, n), bounds.lower, bounds.upper, label=name, hint=hint)
             for name, value in zip(("start", "end"), joints, strict=True)
         )
+        largest = bounds.velocity
         first_rates, last_rates = (
-            clip_to_limits(end_velocities(name, value, n), -bounds.velocity, bounds.velocity, label=name, **words)
+            clip_to_limits(machine, end_velocities(name, value, n), -largest, largest, label=name, hint=hint)
             for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
         )
         known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)

@@ -10,7 +10,7 @@ Kim and Kim 2011, for any machine on a fixed or floating base and any tasks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -57,16 +57,15 @@ def joint_motion_problem(
         ProblemError: Sizes do not match, or an end is outside the limits.
     """
     bounds, n = (limits or Limits()).bounds(machine, ("velocity",)), machine.joint_size
-    ends = []
-    for name, value in (("start", start), ("end", end)):
-        words: dict[str, Any] = {"label": name, "names": machine.robot.joint_names, "hint": "keep within them"}
-        joints, _ = checked_configuration(machine, value, None)
-        ends.append(clip_to_limits(joints, bounds.lower, bounds.upper, **words))
+    first, last = (
+        clip_to_limits(machine, checked_configuration(machine, value, None)[0], bounds.lower, bounds.upper, label=name)
+        for name, value in (("start", start), ("end", end))
+    )
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
     problem.horizon(require.positive("horizon", horizon))
     joints = problem.state(
-        "joints", n, initial=ends[0], terminal=ends[1], lower=bounds.lower, upper=bounds.upper,
+        "joints", n, initial=first, terminal=last, lower=bounds.lower, upper=bounds.upper,
         unit=machine.robot.unit(),
     )  # fmt: skip
     fastest = (1 + RATE_SLACK) * bounds.velocity
@@ -193,9 +192,8 @@ def minimum_velocity_problem(
         if stretch.equations is not None:
             begins = stretch is stretches[0] and start is not None
             checked_tasks(stretch.equations, base, joints, duration, check_start=begins)
-    bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
-    ends: dict[str, Any] = {"label": "start", "names": names, "hint": "start inside them"}
-    joints = clip_to_limits(joints, bounds.lower, bounds.upper, **ends)
+    bounds = limits.bounds(machine, ("velocity",))
+    joints = clip_to_limits(machine, joints, bounds.lower, bounds.upper, label="start")
     options = ToolMotionSetup(
         base=base, start=None if start is None else joints, reference=joints, cyclic=cyclic, weights=weights,
         bounds=bounds, clearance_constraints=setup.clearance_constraints,
@@ -220,7 +218,4 @@ def _attach_guess(
             options: dict[str, Any] = {"lower": bounds.lower, "upper": bounds.upper, "weights": weights}
             motions.append(track_tasks(stretch.equations, at, place, times, damping=damping, **options))
         place, at = motions[-1].base[:, -1], motions[-1].joints[:, -1]
-    declared = motion.problem.declared
-    for name, guess in motion.guess(motions, 0).items():
-        pool = declared.states if name in declared.states else declared.controls
-        pool[name] = replace(pool[name], guess=guess)
+    motion.problem.declared.set_guesses(motion.guess(motions, 0))

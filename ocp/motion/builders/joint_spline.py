@@ -9,7 +9,6 @@ inverse dynamics tau(q, rate, acceleration) without gravity, and rest(q) that of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -55,6 +54,7 @@ class SplineSettings:
     # number of points of a path to which targets are compared, to find those that belong to the path
     path_samples: int = 200
     projections: int = 8  # number of Newton steps by which targets are projected onto the path
+    samples: int = 400  # least number of samples of a plan
     # least number of samples of a plan in each segment of the path: the third derivative of a blend is then within
     # some percent, and the duration of a motion, which depends on its cube root, within 1e-3
     segment_samples: int = 24
@@ -132,9 +132,7 @@ class PlannedJoints:
         return np.asarray(np.clip(s, 0.0, self.length))
 
 
-def joint_path(
-    machine: Machine, plan: Any, path: PathLike, *, samples: int = 400, names: Sequence[str] | None = None
-) -> PlannedJoints:
+def joint_path(machine: Machine, plan: Any, path: PathLike) -> PlannedJoints:
     """Return a spline of joint positions over the distance along a path, from a plan along the path or from samples.
 
     Args:
@@ -143,14 +141,11 @@ def joint_path(
             free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
             (M,) from 0 to the path's length and joint positions (M, n); 24 samples resolve a segment of the path.
         path: Path of the tool.
-        samples: Least number of samples of a plan or a solution. Short segments of the path have more.
-        names: Names of the joints; the robot's if None.
 
     Raises:
         ProblemError: The plan has no joints, or its tasks do not run along the path; the samples have
             other shapes, are too few, do not increase, or do not reach both ends.
     """
-    require.count("samples", samples, 2 * DEGREE + 3)
     for attribute in ("robot", "joint_size"):
         if isinstance(machine, type) or not hasattr(machine, attribute):
             raise ProblemError(f"{machine!r} is no machine; it has no {attribute}", name="machine", value=machine)
@@ -158,18 +153,14 @@ def joint_path(
     if not isinstance(length, float | int) or not length > 0:
         raise ProblemError(f"the path {path!r} has no length", name="path", value=path)
     if hasattr(plan, "task_share"):
-        plan = _samples_of_plan(plan, path, float(length), samples)
-    s, joints = _checked_samples(plan, path, samples, machine.joint_size)
-    own = require.each("joints along a path: names", machine.robot.joint_names if names is None else names, str)
-    if len(own) != machine.joint_size:
-        message = f"{len(own)} names for {machine.joint_size} joints"
-        raise ProblemError(message, name="names", value=own, limit=machine.joint_size)
+        plan = _samples_of_plan(plan, path)
+    s, joints = _checked_samples(plan, path, machine.joint_size)
     half = np.union1d(np.arange(0, len(s), 2), len(s) - 1)
     error = float(np.abs(_interpolate(s[half], joints[half], path)(s) - joints).max())
     used = _informative_samples(s, joints, path)
     curves = _interpolate(s[used], joints[used], path)
     torques = _torque_function(machine) if isinstance(machine, FixedBase) else None
-    return PlannedJoints(machine, own, float(length), error, curves, torques)
+    return PlannedJoints(machine, tuple(machine.robot.joint_names), float(length), error, curves, torques)
 
 
 def _interpolate(s: Array, joints: Array, path: Any) -> Any:
@@ -184,7 +175,7 @@ def _informative_samples(s: Array, joints: Array, path: Any) -> NDArray[np.intp]
     rounding error: of the third derivative, the error of interpolation is then below that of rounding, which falls with
     the cube of the distance between samples.
     """
-    slopes, bounds = np.abs(np.diff(joints, axis=0)) / np.diff(s)[:, None], getattr(path, "bounds", s[[0, -1]])
+    slopes, bounds = np.abs(np.diff(joints, axis=0)) / np.diff(s)[:, None], path.bounds
     tolerance = 2**3 * np.finfo(float).eps * (np.abs(joints).max() + s[-1] * slopes.max())
     used, segment = np.arange(len(s)), np.searchsorted(bounds[1:-1], s, side="right")
     while True:
@@ -210,7 +201,7 @@ def _knots(s: Array, path: Any) -> Array:
     knots.
     """
     inner = s[DEGREE // 2 + 1 : -(DEGREE // 2) - 1].copy()
-    bounds = np.asarray(getattr(path, "bounds", s[[0, -1]]), dtype=float)[1:-1]
+    bounds = path.bounds[1:-1]
     if bounds.size:
         jumps = path.curvature_jumps()
         sharp = jumps > ROUNDING_SHARE * (1 + jumps.max())
@@ -226,36 +217,35 @@ def _knots(s: Array, path: Any) -> Array:
     return np.concatenate([s[0] * ends, inner, s[-1] * ends])
 
 
-def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
+def _samples_of_plan(plan: Any, path: Any) -> tuple[Array, Array]:
     """Return path distances (M,) and joint positions (M, n) of a plan whose tasks run along the path; raise
     ProblemError if they do not.
 
     The times are chosen so that the distances are nearly evenly spaced, also where the tool speeds up from rest.
     """
-    times, places = np.linspace(0.0, plan.horizon, samples), _sample_places(path, length, samples)
+    times, places = np.linspace(0.0, plan.horizon, SPLINE.samples), _sample_places(path)
     if not (plan.targets and hasattr(path, "at")):
-        times = np.interp(places, length * plan.task_share(times), times)
-        return length * plan.task_share(times), plan.at(times)["joints"]
+        times = np.interp(places, path.length * plan.task_share(times), times)
+        return path.length * plan.task_share(times), plan.at(times)["joints"]
     if not hasattr(plan, "targets_at"):
         words = f"{plan!r} consists of several motions: give (distances, joints) of one motion along the path instead"
         raise ProblemError(words, name="plan", value=type(plan).__name__)
-    distances = _distances_of_targets(plan, path, length, times)
-    times = np.interp(places, distances, times)
-    return _distances_of_targets(plan, path, length, times), plan.at(times)["joints"]
+    times = np.interp(places, _distances_of_targets(plan, path, times), times)
+    return _distances_of_targets(plan, path, times), plan.at(times)["joints"]
 
 
-def _sample_places(path: Any, length: float, samples: int) -> Array:
-    """Return at least `samples` distances along a path: evenly spaced in each segment, and several in every segment."""
-    bounds = np.asarray(getattr(path, "bounds", (0.0, length)), dtype=float)
-    shares = (samples - 1) * np.diff(bounds) / length
+def _sample_places(path: PathLike) -> Array:
+    """Return distances along a path at which a plan is sampled, evenly spaced in each segment."""
+    shares = (SPLINE.samples - 1) * np.diff(path.bounds) / path.length
     counts = np.maximum(np.ceil(shares * (1 - ROUNDING_SHARE)), SPLINE.segment_samples).astype(np.intp)
-    return subdivide(bounds, counts)
+    return subdivide(path.bounds, counts)
 
 
-def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
+def _distances_of_targets(plan: Any, path: Any, times: Array) -> Array:
     """Project the targets of a plan at given times onto a path, and return their distances along the path, m. Raise
     ProblemError unless the targets run along the whole path. Shape (M,).
     """
+    length = path.length
 
     def fail(fault: str, at: int, value: float) -> ProblemError:
         words = f"the plan's tasks {fault} at {times[at]:.6g} s, but must run along all of the path, without a pause; "
@@ -297,7 +287,7 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
     return np.asarray(distance)
 
 
-def _checked_samples(plan: Any, path: PathLike, samples: int, size: int) -> tuple[Array, Array]:
+def _checked_samples(plan: Any, path: PathLike, size: int) -> tuple[Array, Array]:
     """Return path distances (M,) and joint positions (M, n) of a solution or of given samples, after checking them."""
     length = float(path.length)
     if isinstance(plan, tuple):
@@ -307,7 +297,7 @@ def _checked_samples(plan: Any, path: PathLike, samples: int, size: int) -> tupl
             raise ProblemError(f"samples are not numeric: {error}", name="plan", value=plan) from error
     else:
         require.instance("plan", plan, Solution)
-        fractions = _sample_places(path, length, samples) / length
+        fractions = _sample_places(path) / length
         try:
             joints = np.asarray(plan.at_fraction(fractions)["joints"], dtype=float)
         except KeyError as error:

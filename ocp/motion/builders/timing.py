@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from ocp.console import interruptible
+from ocp.curves import gauss_points
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.methods import solve
@@ -95,11 +96,10 @@ class TimingProblem:
         breaks, begin, horizon = np.asarray(curve.breaks), self.span[0], self.span[1] - self.span[0]
         v, a = (solution.state_interpolant(breaks) * np.array(self.units[:2])).T
         jerk = curve.values[:, 0, 0] * self.units[2]
-        points, weights = np.polynomial.legendre.leggauss(8)
-        inside = (breaks[:-1, None] + np.diff(breaks)[:, None] * (points + 1) / 2).ravel()
-        speed = solution.state_interpolant(inside)[:, 0] * self.units[0]
-        pace = (self.reference.at(begin + horizon * inside).speed / speed).reshape(-1, len(points))
-        durations = horizon * np.diff(breaks) * (pace @ weights) / 2
+        inside, shares = gauss_points(breaks, 8)
+        speed = solution.state_interpolant(inside.ravel())[:, 0] * self.units[0]
+        pace = (self.reference.at(begin + horizon * inside.ravel()).speed / speed).reshape(inside.shape)
+        durations = horizon * (pace * shares).sum(axis=1)
         s = self.reference.at(begin + horizon * breaks).distance
         first, last = _ends(self.reference, self.span)
         ramps = 3 * first / v[0], 3 * last / v[-1]

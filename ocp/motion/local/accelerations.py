@@ -309,7 +309,7 @@ def resolve_accelerations(
     equations = bind(require.instance("machine", machine, Standing), tasks)
     duration, n = require.positive("horizon", horizon), machine.joint_size
     own = AccelerationOptions() if options is None else require.instance("options", options, AccelerationOptions)
-    begin, joints, base = Start.of_known(start, machine)
+    begin, joints, base = Start.of(start, machine, known=True)
     _check_law(machine, equations.size, law, own.layers)
     require.positive("step", step)
     checked_tasks(equations, base, joints, duration)

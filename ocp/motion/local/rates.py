@@ -138,7 +138,7 @@ def resolve(
     """
     equations = bind(machine, tasks)
     own = RateOptions() if options is None else require.instance("options", options, RateOptions)
-    _, joints, base = Start.of_known(start, machine)
+    _, joints, base = Start.of(start, machine, known=True)
     duration = horizon_of([part.task for part in equations.bound], horizon)
     rate_weights = checked_weights(own.weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)

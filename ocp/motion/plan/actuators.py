@@ -10,8 +10,8 @@ of the squared rates is then the guess of one motion, and the lowest of their co
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import attrgetter
-from typing import Any, NamedTuple
+from operator import itemgetter
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -40,14 +40,6 @@ from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTI
 
 GUESS_PLACES = np.append(ROUNDING_SHARE, np.arange(1, 17) / 16)
 """Places, 0 to 1, in an interval of the mesh at which an initial guess is sampled: jerks jump between intervals."""
-
-
-class _Demand(NamedTuple):
-    """Largest demand on an actuator: ratio to its limit, name of the limited quantity, and a `Reason` with details."""
-
-    ratio: float = 0.0
-    quantity: str = ""
-    reason: Reason | None = None
 
 
 ACTUATOR_LIMITS = tuple(kind for kind in LIMITED if kind != "velocity")
@@ -110,26 +102,27 @@ def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
     _, _, rates, accelerations = samples
     demands = {"acceleration": accelerations, "torque": torques, "power": np.maximum(torques * rates, 0.0)}
     bounds = limits.bounds(machine)
-    each = [_demand(machine.robot, *of, t, bounds) for of in demands.items()]
-    return max(each, key=attrgetter("ratio")).reason
+    ratios = [pair for of in demands.items() for pair in _demand(machine.robot, *of, t, bounds)]
+    return max(ratios, key=itemgetter(0), default=(0.0, None))[1]
 
 
-def _demand(robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds) -> _Demand:
-    """Return the largest ratio of a joint quantity, with values (M, n), to its limit; the ratio is 0 without limits."""
+def _demand(
+    robot: Robot, quantity: str, values: Array, t: Array, bounds: JointBounds, remedy: str = ""
+) -> list[tuple[float, Reason]]:
+    """Return the largest ratio of a joint quantity (M, n) to its limit, and the reason; an empty list if unlimited."""
     most_allowed = getattr(bounds, quantity)
     if not np.isfinite(most_allowed).any():
-        return _Demand()
+        return []
     row, index = np.unravel_index(int(np.argmax(np.abs(values) / most_allowed)), values.shape)
     joint = robot.moving_joints[index]
     units = {"acceleration": f"{joint.unit}/s^2", "jerk": f"{joint.unit}/s^3", "torque": joint.effort_unit}
     time, value, allowed = float(t[row]), float(abs(values[row, index])), float(most_allowed[index])
     words = f"{quantity} of {joint.name!r} is {value:.4g} {units.get(quantity, 'W')} at {time:.4g} s"
-    details = joint.name, value, allowed, time
-    reason = Reason(Rejection.ACTUATORS, f"{words}, {allowed:.4g} allowed", *details)
-    return _Demand(value / allowed, quantity, reason)
+    details = joint.name, value, allowed, time, remedy
+    return [(value / allowed, Reason(Rejection.ACTUATORS, f"{words}, {allowed:.4g} allowed", *details))]
 
 
-def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> _Demand | None:
+def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits) -> Reason | None:
     """Return the most exceeded limit of joints whose motion the tasks determine; None if no limit is exceeded.
 
     The limits are those of acceleration, jerk and torque at rest, on the branch of a plan. A joint that no self-motion
@@ -138,7 +131,7 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
     determine a gravity torque that no self-motion changes. Returns None on a floating base, with a free horizon, and if
     there is no such joint.
     """
-    machine, demands = request.machine, list[_Demand]()
+    machine, ratios = request.machine, list[tuple[float, Reason | None]]()
     if machine.base_size or request.time_cost is not None:
         return None
     configuration = np.random.default_rng(0).normal(size=machine.joint_size)
@@ -163,31 +156,28 @@ def demand_of_tasks(request: PlanRequest, unlimited: SolvedPlan, limits: Limits)
         static = gravity_at.map(2)(joints[[0, -1]].T)[0].full().T
         holds = [stretch is request.stretches[-k] and rests for k, rests in enumerate(request.rests)]
         at_rest = np.array(holds)[:, None] * fixed * static
-        of_kinds = ("torque", at_rest, t[[0, -1]]), ("acceleration", determined * accelerations, t)
-        for of in (*of_kinds, ("jerk", determined * jerks, t[1:])):
-            demands.append(_demand(machine.robot, *of, bounds))
-    largest = max(demands, key=attrgetter("ratio"), default=_Demand())
-    return largest if largest.ratio > 1.0 + LIMIT_SHARE else None
+        words = "the arm must hold itself at rest there: reduce its load, or move the tasks"
+        ratios += _demand(machine.robot, "torque", at_rest, t[[0, -1]], bounds, words)
+        words = "the tasks determine the motion of this joint: lower the speed, acceleration or jerk of the tasks"
+        for of in (("acceleration", determined * accelerations, t), ("jerk", determined * jerks, t[1:])):
+            ratios += _demand(machine.robot, *of, bounds, words)
+    ratio, reason = max(ratios, key=itemgetter(0), default=(0.0, None))
+    return reason if ratio > 1.0 + LIMIT_SHARE else None
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
-    """Solve a request within its actuator limits; the initial guess is a motion that ignores these limits.
+    """Solve a request within its actuator limits from the guess `unlimited`, a motion that ignores these limits.
 
-    Args:
-        request: The request. If many starts are equally good, that of the first solution is fixed.
-        start, reference: As in `tool_motion_problem`.
-        unlimited: Motion without actuator limits.
+    If many starts are equally good, that of the first solution is fixed. Start and reference are those of
+    `ToolMotionSetup`.
 
     Raises:
         SolveError: No motion was found. Names the joint, the time, the demand without the limit, and the limit.
     """
     limits = request.actuator_limits or request.limits
     if (demand := demand_of_tasks(request, unlimited, limits)) is not None:
-        words = "the tasks determine the motion of this joint: lower the speed, acceleration or jerk of the tasks"
-        if demand.quantity == "torque":
-            words = "the arm must hold itself at rest there: reduce its load, or move the tasks"
-        error = SolveError(words)
-        _add_demand(error, demand.reason)
+        error = SolveError(demand.remedy)
+        _add_demand(error, demand)
         raise error
     first = request.stretches[0]
     if request.start is None:
@@ -329,7 +319,6 @@ def _set_guess(motion: ToolMotion, unlimited: SolvedPlan, mesh: Collocation) -> 
             "jerks": _slopes(accelerations, times.reshape(shape)),
         }
         named = {name + stretch.suffix: values for name, values in values_by_name.items()}
-        for name, values in {**named, CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}.items():
-            for pool in (motion.problem.declared.states, motion.problem.declared.controls):
-                if values is not None and (variable := pool.get(name)) is not None:
-                    pool[variable.name] = replace(variable, guess=Samples(fractions * motion.horizon, values))
+        named |= {CLOCK: sample.get(CLOCK), PACE: sample.get(PACE)}
+        guesses = {name: Samples(fractions * motion.horizon, each) for name, each in named.items() if each is not None}
+        motion.problem.declared.set_guesses(guesses)

@@ -83,11 +83,8 @@ class CandidateQueue:
     def __init__(self, solver: Solver, settings: PlannerSettings, *, include_costlier: bool = False) -> None:
         """Create an empty queue of candidates for the solver that advances them.
 
-        Args:
-            solver: Solver of the candidates.
-            settings: Settings of the planner.
-            include_costlier: Whether all batches include costlier motions, see `run`, and motions of the same cost,
-                since they will be ranked by another cost.
+        With `include_costlier` all batches include costlier motions, see `run`, and motions of the same cost, since
+        they will be ranked by another cost.
         """
         self.solver, self.settings, self._began = solver, settings, time.thread_time()
         self._always_costlier = include_costlier

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -24,7 +25,7 @@ from ocp.methods import solve
 from ocp.motion.builders.clearance import APART
 from ocp.motion.builders.dynamics_plan import barrier_options
 from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
-from ocp.motion.local.collisions import Collision
+from ocp.motion.local.collisions import Collision, find_collisions
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import solve_with_accelerations
@@ -63,11 +64,7 @@ class CandidateSolver(Solver):
     """
 
     def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
-        """Prepare the solver for the candidates of a request.
-
-        Args:
-            start, reference: As in `tool_motion_problem`.
-        """
+        """Prepare the solver for the candidates of a request; start and reference are those of `ToolMotionSetup`."""
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
         self.turning = request.turning_joints
         constraints = request.clearance_constraints
@@ -107,18 +104,14 @@ class CandidateSolver(Solver):
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
         """Return whether the tasks must be relaxed, because their Jacobian is nearly singular on a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
-        return self._can_relax and any(sample.is_nearly_singular for sample in samples)
-
-    @property
-    def _can_relax(self) -> bool:
-        return self.request.time_cost is None
+        return self.request.time_cost is None and any(sample.is_nearly_singular for sample in samples)
 
     def _may_relax(self, candidate: Candidate) -> bool:
         """Return whether relaxed tasks may save a rejected candidate; they cannot resolve collisions."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
-        return self._can_relax and seed.thorough and not seed.relaxed
+        return self.request.time_cost is None and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
         """Return why a candidate failed: violations by its guess or, if tasks are relaxed, by its last iterate."""
@@ -404,7 +397,7 @@ class CandidateSolver(Solver):
         if self._collisions[0] is not solution:
             collisions = list[Collision]()
             for sample in self._motion_samples(solution):
-                collisions += constraints.find_collisions(sample.base, sample.joints, sample.t)
+                collisions += find_collisions(constraints.scene, sample.base, sample.joints, sample.t)
             worst: dict[int, Collision] = {}
             for collision in sorted(collisions, key=lambda collision: collision.distance):
                 worst.setdefault(collision.pair, collision)
@@ -418,11 +411,10 @@ class CandidateSolver(Solver):
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
         """Return the collisions along the local (resolved-rate) motion of an initial guess, in order of severity."""
-        constraints, collisions = self.request.clearance_constraints, list[Collision]()
-        for motion in seed.local if constraints is not None else ():
-            assert constraints is not None
-            collisions += constraints.find_collisions(motion.base[0], motion.joints[0], motion.t)
-        return sorted(collisions, key=lambda collision: collision.distance)
+        if (constraints := self.request.clearance_constraints) is None:
+            return []
+        of_motions = (find_collisions(constraints.scene, each.base[0], each.joints[0], each.t) for each in seed.local)
+        return sorted(chain.from_iterable(of_motions), key=attrgetter("distance"))
 
     @property
     def no_clear_configuration(self) -> bool:

@@ -60,22 +60,17 @@ def plan_sequence(
 ) -> PhasedPlan:
     """Plan motions to consecutive goals as the phases of one problem, which minimises their total cost.
 
-    A pose is reached in the configuration that is nearest to the goal before it.
-
-    Args:
-        machine: Arm on a fixed or floating base; each goal may have its own, with the same joints.
-        goals: The goals, each with a duration in s, or FreeTime(...).
-        total: Duration of all of them together, s, if some are free; None leaves it free.
-        options: Start, which is required; cost, the squared torques if None; limits, beside which the robot's own
-            torque limits hold; and seed.
-        constraints: Clearance constraints, or None.
+    A pose is reached in the configuration that is nearest to the goal before it. Each goal has a duration in s, or
+    FreeTime(...), and may have its own machine with the same joints. `total` is the duration of all of them together,
+    s, if some are free; None leaves it free. The cost is that of the squared torques by default, and the robot's own
+    torque limits hold beside the limits of the options.
 
     Raises:
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
     motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
-    state, joints, base = Start.of_known(options.start, motors)
+    state, joints, base = Start.of(options.start, motors, known=True)
     own_limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     cost = None if options.cost is None else require.instance("cost", options.cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
@@ -109,19 +104,27 @@ def plan_goal(
 ) -> SolvedPlan:
     """Plan the motion to one goal: around obstacles or, if the goal has its own tasks or machine, as a single phase.
 
-    Args:
-        machine: Arm on a fixed or floating base.
-        goal: The goal.
-        horizon: s, "free", or None for the duration of the goal.
-        options, constraints: As in `plan_sequence`. A goal that is only a target has another default cost: the squared
-            joint velocities, and also the time if the horizon is free.
+    A goal that is only a target has another default cost than `plan_sequence`: the squared joint velocities, and also
+    the time if the horizon, s, is "free". A horizon of None is the duration of the goal.
 
     Raises:
         ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
     """
-    if isinstance(machine, FixedBase) and has_only_target(goal):
-        return plan_to_goal(_goal_request(machine, goal, horizon, options, constraints=constraints))
-    return plan_sequence(machine, (goal,), horizon, options, constraints=constraints)
+    if not (isinstance(machine, FixedBase) and has_only_target(goal)):
+        return plan_sequence(machine, (goal,), horizon, options, constraints=constraints)
+    state, joints, _ = Start.of(options.start, machine, known=True)
+    limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
+    is_free = isinstance(horizon, str)
+    if is_free:
+        require.choice("horizon", horizon, ("free",))
+    cost = Cost(time=float(is_free)) if options.cost is None else require.instance("cost", options.cost, Cost)
+    goals = goal_configurations(machine, goal, joints, limits=limits, constraints=constraints, seed=options.seed)
+    request = GoalRequest(
+        machine, joints, goals, goal.duration if horizon is None or is_free else horizon, limits, cost,
+        start_velocity=state.velocity, end_velocity=goal.velocity, clearance_constraints=constraints,
+        seed=options.seed, time_limit=time_left() if np.isfinite(time_left()) else None,
+    )  # fmt: skip
+    return plan_to_goal(request)
 
 
 def has_only_target(goal: Goal) -> bool:
@@ -130,38 +133,10 @@ def has_only_target(goal: Goal) -> bool:
     return not has_tasks and goal.machine is None and goal.base is None
 
 
-def _goal_request(
-    machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
-) -> GoalRequest:
-    """Check the arguments of a motion to one goal, and return them as a request."""
-    state, joints, _ = Start.of_known(options.start, machine)
-    limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
-    is_free = isinstance(horizon, str)
-    if is_free:
-        require.choice("horizon", horizon, ("free",))
-    cost = Cost(time=float(is_free)) if options.cost is None else require.instance("cost", options.cost, Cost)
-    return GoalRequest(
-        machine,
-        joints,
-        goal_configurations(machine, goal, joints, limits=limits, constraints=constraints, seed=options.seed),
-        horizon=goal.duration if horizon is None or is_free else horizon,
-        limits=limits,
-        cost=cost,
-        start_velocity=state.velocity,
-        end_velocity=goal.velocity,
-        clearance_constraints=constraints,
-        seed=options.seed,
-        time_limit=time_left() if np.isfinite(time_left()) else None,
-    )
-
-
 def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPlan:
     """Plan the motion of a standing machine that makes given footsteps, as one optimal control problem with phases.
 
-    Args:
-        machine: Machine of the first stance, `steps.stances[0]`.
-        steps: The steps.
-        options: Start, the joint positions in the order of this machine; cost; and limits.
+    The machine is that of the first stance, `steps.stances[0]`, and the start is in the order of its joints.
 
     Raises:
         ProblemError: As `steps_problem`; or the machine is not that of the first stance.
@@ -171,7 +146,7 @@ def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPl
     if not isinstance(machine, Stance) or machine.robot.joint_names != stance.robot.joint_names:
         words = "steps begin in their first stance: give plan(steps.stances[0], steps, start=...)"
         raise ProblemError(words, name="machine", value=machine)
-    joints = Start.of_known(options.start, stance)[1]
+    joints = Start.of(options.start, stance, known=True)[1]
     begin = steps.in_order(stance, joints[None])[0]
     return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=options.cost, limits=options.limits), joints)
 
@@ -188,7 +163,7 @@ def plan_capture(
     chaser = require.instance("machine", machine, FreeFloating)
     setup: dict[str, Any] = {"cost": options.cost, "limits": options.limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=options.start, **setup)
-    return _plan_of_phases(chaser, solution, Start.of_known(options.start, chaser)[1])
+    return _plan_of_phases(chaser, solution, Start.of(options.start, chaser, known=True)[1])
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
@@ -209,25 +184,19 @@ def goal_configurations(
 ) -> Array:
     """Return configurations that satisfy a goal, sorted by distance from `near`. Shape (K, n).
 
-    They are within the joint limits and, at a pose, collision-free.
-
-    The tip of a goal with a region is at the centre of the region, and at random places in it. Joints that do not move
-    the tip stay where they are.
-
-    Args:
-        near: Configuration from which distances are measured. Shape (n,).
+    They are within the joint limits and, at a pose, collision-free. The tip of a goal with a region is at the centre of
+    the region, and at random places in it. Joints that do not move the tip stay where they are in `near`, (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`; or the joints of the goal do not fit, see `clip_to_limits`.
     """
-    bounds, names = limits.bounds(machine), machine.robot.joint_names
+    bounds = limits.bounds(machine)
     if not goal.has_pose:
         if goal.joints is None:
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
         values = require.array("goal", np.nan_to_num(floats(goal.joints)), (len(near),), meaning="one for each joint")
         joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
-        words: dict[str, Any] = {"label": "end", "names": names, "hint": "end inside them"}
-        return clip_to_limits(joints, bounds.lower, bounds.upper, **words)[None]
+        return clip_to_limits(machine, joints, bounds.lower, bounds.upper, label="end")[None]
     scene, options = None if constraints is None else constraints.scene, IkOptions(limits=limits.joints)
     tasks = [goal.task, *(replace(goal.task, position=point) for point in _points_inside(goal.region, seed))]
     samples = {} if goal.region is None else {"starts": REGION_STARTS}
@@ -276,12 +245,7 @@ def plan_to_stand(
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
     leads to a plan.
 
-    Args:
-        machine: The standing machine.
-        tasks, horizon: As in `ocp.motion.plan.plan`.
-        options: Start, limits, search and seed; `cost` weights the terms of the cost, and `cyclic` is False.
-        constraints: Clearance constraints, or None.
-        wrenches: External wrenches as a function of time and tip position, or None.
+    `wrenches` are external wrenches as a function of time and tip position, or None.
 
     Raises:
         ProblemError: A cyclic motion, tasks that are active only a part of the time, a horizon that is no number, or as

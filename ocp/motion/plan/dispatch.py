@@ -157,10 +157,9 @@ def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanO
         _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
         return plan_steps(machine, tasks, options)
     if _is_sequence(tasks):
-        if horizon is not None:
-            require.choice("horizon", horizon, ("free",))
+        require.choice("horizon", horizon, ("free", None))
         _check_unused("a sequence of goals and tasks", cyclic=cyclic)
-        return plan_consecutive(machine, tasks, options, scene=scene, free=horizon is not None)
+        return plan_consecutive(machine, tasks, horizon, options, scene=scene)
     constraints = clearance_for(machine, options.limits, scene)
     if isinstance(tasks, Capture):
         _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic)
@@ -173,7 +172,7 @@ def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanO
         moving = constraints is not None and constraints.scene.has_moving_obstacles
         is_open = horizon is None or (isinstance(horizon, str) and horizon == "free")
         if isinstance(machine, FixedBase) and is_open and not moving and _are_separate(goals):
-            return plan_consecutive(machine, goals, options, scene=scene, free=horizon is not None)
+            return plan_consecutive(machine, goals, horizon, options, scene=scene)
         return plan_sequence(machine, goals, horizon, options, constraints=constraints)
     if isinstance(machine, Standing):
         return plan_to_stand(machine, tasks, horizon, options, constraints=constraints, wrenches=wrenches)

@@ -144,12 +144,8 @@ class GoalTask:
     @property
     def moves(self) -> bool:
         """Whether the joints may move at the start or at the end of the motion."""
-        return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
-
-    @property
-    def end_velocities(self) -> tuple[Any, Any]:
-        """Requested joint velocities at the start and at the end."""
-        return self.request.start_velocity, self.request.end_velocity
+        ends = self.request.start_velocity, self.request.end_velocity
+        return not all(isinstance(velocity, str) and velocity == "rest" for velocity in ends)
 
     @property
     def is_fastest(self) -> bool:
@@ -220,13 +216,13 @@ def fastest_candidate(task: GoalTask, path: JointPath) -> Candidate:
 
 def _spline_candidate(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
     """Return an audited, locally optimal spline near a path; the horizon is free if it is None."""
-    settings = task.request.settings.spline
-    ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
+    request, settings = task.request, task.request.settings.spline
+    ends = (end_velocities("", each, len(task.start)) for each in (request.start_velocity, request.end_velocity))
     limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
     try:
-        for _ in range(task.request.settings.margins):
-            with task.request.limited(task.request.settings.search_share * time_left()):
-                motion = optimal_motion_near(limits, path.joints, task.request.cost, horizon, settings=settings)
+        for _ in range(request.settings.margins):
+            with request.limited(request.settings.search_share * time_left()):
+                motion = optimal_motion_near(limits, path.joints, request.cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
             report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:

@@ -151,9 +151,7 @@ def _nearest_and_spread(goals: Array, changes: Array, most: int) -> Array:
 
 def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds) -> Array:
     joints, _ = checked_configuration(machine, value, None)
-    hint = "give joints within their limits"
-    names = machine.robot.joint_names
-    return clip_to_limits(joints, bounds.lower, bounds.upper, label=name, names=names, hint=hint)
+    return clip_to_limits(machine, joints, bounds.lower, bounds.upper, label=name)
 
 
 def _collision_error(scene: Any, name: str, collision: Any) -> ProblemError:

@@ -64,13 +64,7 @@ def plan_from_configurations(
 ) -> tuple[SolvedPlan, float | None]:
     """Return the lowest-cost plan from any of the start configurations, and a lower cost bound (None if unknown).
 
-    Args:
-        request: The request.
-        configurations: Joint configurations at the start, the best conditioned first. Shape (K, n).
-        solver: Solver of the candidates.
-
-    Raises:
-        ProblemError, SolveError: As in `ocp.motion.plan.plan`.
+    The configurations (K, n) are sorted, the best conditioned first. Raises ProblemError and SolveError as `plan`.
     """
     # the lowest cost of the squared rates is not that of another cost
     queue = CandidateQueue(solver, request.settings, include_costlier=request.cost is not None)
@@ -128,11 +122,8 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
     """Return candidates with local (resolved-rate) motions as guesses, by cost; motions that miss the tasks come last.
 
-    The cost includes the cost of the approach from the configuration `near` of the request.
-
-    Args:
-        motions: K local motions through each time interval.
-        options: Further fields of `Seed`.
+    The cost includes the cost of the approach from the configuration `near` of the request. `motions` are K local
+    motions through each time interval, `options` further fields of `Seed`.
     """
     errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
     approaches = _approach_costs(solver.request, motions[0].joints[:, 0])
@@ -349,9 +340,7 @@ def clearance_for(
 ) -> ClearanceConstraints | None:
     """Return the clearance constraints of a motion in a scene; None if no pair of bodies needs a check.
 
-    Args:
-        machine, limits, scene: As in `plan`.
-        why_static: Why no obstacle may move, as the text of an error; "" if obstacles may move.
+    `why_static` is the text of the error about a moving obstacle; "" if obstacles may move.
 
     Raises:
         ProblemError: A value of the scene is invalid, or does not fit the machine; or an obstacle may not move.
@@ -374,11 +363,7 @@ def clearance_for(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of `plan` besides machine, tasks, horizon and scene; they are not yet checked against the machine.
-
-    Attributes:
-        start, cyclic, cost, limits, search, seed: As in `plan`.
-    """
+    """Options of `plan` besides machine, tasks, horizon and scene; they are not yet checked against the machine."""
 
     start: Any = None
     cyclic: Any = False
@@ -418,8 +403,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
             checked_tasks(stretch.equations, base, configuration, duration, check_start=first)
     if joints is not None:
         bounds = checked_limits.bounds(machine)
-        names, hint = machine.robot.joint_names, "start inside them"
-        joints = clip_to_limits(joints, bounds.lower, bounds.upper, label="start", names=names, hint=hint)
+        joints = clip_to_limits(machine, joints, bounds.lower, bounds.upper, label="start")
     squares = own_cost if own_cost.velocity else replace(own_cost, velocity=1.0)
     request = PlanRequest(
         *(machine, all_tasks, duration, stretches, joints, base, squares.joint_weights(machine.joint_size)),

@@ -66,26 +66,22 @@ def _junction_velocity(rates: Array, smooth: bool) -> Any:
 
 def plan_consecutive(
     machine: Machine,
-    parts: Sequence[Goal | TipTask | Sequence[TipTask]],
+    tasks: Sequence[Goal | TipTask | Sequence[TipTask]],
+    horizon: Literal["free"] | None,
     options: PlanOptions,
     *,
     scene: Scene | Literal[False] | None,
-    free: bool,
 ) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
-    Args:
-        machine: Machine on a fixed or floating base.
-        parts: Goals and tasks in their order. Tasks that are done at once form a sequence of their own.
-        options: Options that all motions share; the start may be None if the first motion is along a task.
-        scene: As in `plan`.
-        free: Whether the planner chooses the durations.
+    Tasks that are done at once form a sequence of their own. The start may be None if the first motion is along a task.
+    The tasks and goals state their durations unless the horizon is "free".
 
     Raises:
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
         SolveError: A part has no motion; names the part.
     """
-    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, free).plan()
+    return _Sequence(checked_motors("plan", machine), tuple(tasks), horizon, options, scene).plan()
 
 
 @dataclass(eq=False)
@@ -94,22 +90,17 @@ class _Sequence:
 
     machine: Machine
     parts: tuple[Any, ...]
+    horizon: Literal["free"] | None
     options: PlanOptions
     scene: Scene | Literal[False] | None
-    free: bool
     state: _Junction = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        start_of = Start.of_known if isinstance(self.parts[0], Goal) else Start.of
-        start, joints, base = start_of(self.options.start, self.machine)
+        known = isinstance(self.parts[0], Goal)
+        start, joints, base = Start.of(self.options.start, self.machine, known=known)
         self.state = _Junction(joints, base, start.velocity)
-
-    @property
-    def horizon(self) -> Literal["free"] | None:
-        """Horizon of each motion of the sequence: "free", or None if its tasks or its goal state the duration."""
-        return "free" if self.free else None
 
     @property
     def smooth(self) -> bool:
@@ -267,14 +258,8 @@ def plan_in_segments(
     divided at time samples, refined to a thousandth of the horizon where that may save a segment. Among divisions into
     the fewest segments, the one whose segments cost least is chosen; reconfigurations cost nothing.
 
-    Args:
-        machine: An arm on a fixed base.
-        tasks, horizon, options: As in `plan`; the tasks are poses that leave at most two degrees of freedom
-            undetermined. Actuator limits do not influence the division, but the segments are planned within them.
-        scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
-
-    Returns:
-        The segments and reconfigurations, with a lower bound of their number.
+    The tasks are poses that leave at most two degrees of freedom undetermined. Actuator limits do not influence the
+    division, but the segments are planned within them. Obstacles are static, since a reconfiguration takes time.
 
     Raises:
         ProblemError: As in `plan`; or an obstacle moves.

@@ -93,17 +93,11 @@ def plan_path(
 ) -> PathPlan:
     """Plan the lowest-cost joint path through tool poses, within limits and collision-free at every waypoint.
 
-    Args:
-        machine: An arm on a fixed base with at most three redundant joints for the poses of its tip. If it has two or
-            three, paths are searched on sections in which the joint or joints nearest to the base have one of several
-            values (see `ocp.motion.search.reconfigurations`). The bound of two is searched on the whole manifolds; that
-            of three follows from the motion of the tool alone (`tool_motion_bound`), and is looser.
-        waypoints: Poses of the tip.
-        options: Cost, limits, and seed of inverse kinematics. The cost is the `length`, the sum of all joint
-            displacements with the `weights` of the joints, which is the default, or the `time`, s, by the velocity
-            limits of the joints, from waypoint to waypoint. The limits are those of the joint positions and, for a
-            time, of the velocities; the robot's own if None.
-        scene: As in `plan`, with static obstacles, since a path has no times.
+    The machine has at most three redundant joints for the poses of its tip. If it has two or three, paths are searched
+    on sections in which the joint or joints nearest to the base have one of several values (see
+    `ocp.motion.search.reconfigurations`). The bound of two is searched on the whole manifolds; that of three follows
+    from the motion of the tool alone (`tool_motion_bound`), and is looser. Limits are those of the joint positions and,
+    if the cost is the time, of the velocities. Obstacles are static, since a path has no times.
 
     Raises:
         ProblemError: The request does not fit the machine. Its subclass Unreachable names the waypoint as time.
@@ -246,13 +240,12 @@ class _WaypointPlanner:
             self.machine,
             best.joints,
             self.limits,
-            best.cost,
             self.constraints,
             self.poses,
+            self.cost,
             tuple(candidates),
             lower_bound or None,
             best.breaks,
-            self.cost,
         )
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------

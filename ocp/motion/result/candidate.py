@@ -179,11 +179,7 @@ class Candidate:
 
     @classmethod
     def of_record(cls, record: Sequence[Any], solution: Solution | None) -> Candidate:
-        """Rebuild a candidate from the data of a plan file; `solution` is its motion unless the candidate was rejected.
-
-        Args:
-            record: As `record` returns it; it is not trusted.
-            solution: Motion of the plan.
+        """Rebuild a candidate from a `record` that is not trusted; `solution` is its motion unless it was rejected.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
@@ -213,22 +209,20 @@ class Candidate:
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
-    def finished(self) -> Candidate:
-        """Return the candidate as a plan lists it, without the data of intermediate solution stages."""
-        solution = self.solution if self.stage >= Stage.FINE else None
-        return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)
-
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Return finished candidates: first the lowest-cost candidate that passed, then the others by rising cost.
 
-    Other candidates that passed are rejected, because they cost more.
+    Other candidates that passed are rejected, because they cost more. The data of intermediate stages are left out.
     """
     best = min((c for c in candidates if c.passed), key=lambda c: c.total)
     costlier = Reason(Rejection.COSTLIER, limit=best.cost)
     order = sorted(candidates, key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.total))
     rejected = [replace(c, reason=c.reason or replace(costlier, value=c.cost)) for c in order[1:]]
-    return [candidate.finished() for candidate in (best, *rejected)]
+    return [
+        Candidate(c.start, c.cost, c.reason, c.stage, c.solution if c.stage >= Stage.FINE else None, audit=c.audit)
+        for c in (best, *rejected)
+    ]
 
 
 @dataclass(frozen=True)
@@ -309,17 +303,16 @@ class MotionSample:
 
 def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason | None:
     """Return a rejection reason about the joint that exceeds its rate limit most; None if no joint exceeds it."""
-    reasons = []
-    for sample in samples:
-        shares = _rate_shares(request, sample.rates)
-        k, index = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
-        if shares[k, index] > 1 + SINGULAR.at_limit:
-            joint, time = request.machine.robot.moving_joints[index], float(sample.t[k])
-            rate, limit = float(abs(sample.rates[k, index])), float(request.bounds.velocity[index])
-            words = f"at {time:.4g} s {joint.name!r} would have to move at {rate:.4g} {joint.unit}/s, its limit is "
-            words += f"{limit:.4g} {joint.unit}/s; lengthen the horizon or start elsewhere"
-            reasons.append((rate / limit, Reason(Rejection.INFEASIBLE, words, joint.name, rate, limit, time)))
-    return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
+    sample = max(samples, key=lambda each: float(_rate_shares(request, each.rates).max()))
+    shares = _rate_shares(request, sample.rates)
+    k, index = np.unravel_index(int(shares.argmax()), shares.shape)
+    if shares[k, index] <= 1 + SINGULAR.at_limit:
+        return None
+    joint, time = request.machine.robot.moving_joints[index], float(sample.t[k])
+    rate, limit = float(abs(sample.rates[k, index])), float(request.bounds.velocity[index])
+    words = f"at {time:.4g} s {joint.name!r} would have to move at {rate:.4g} {joint.unit}/s, its limit is "
+    words += f"{limit:.4g} {joint.unit}/s; lengthen the horizon or start elsewhere"
+    return Reason(Rejection.INFEASIBLE, words, joint.name, rate, limit, time)
 
 
 def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:

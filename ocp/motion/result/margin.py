@@ -35,7 +35,7 @@ from ocp.motion.result.plan import CHECKED_TIMES, Plan
 from ocp.motion.result.request import RESERVE, request_of
 from ocp.motion.result.segmented_plan import ConsecutivePlans
 from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan
-from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, foot_edges
 from ocp.problem.hulls import WORLD
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
@@ -341,9 +341,7 @@ def _distance_requirements(plan: Plan) -> list[Requirements]:
 def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> list[Requirements]:
     """Return the requirements on torques, powers and the ground reaction in one part of a plan.
 
-    Args:
-        machine: Machine that moves in this part, with its load.
-        part: The part. Its joints are those of the first machine of the plan, in any order.
+    `machine` is the one that moves in this part, with its load; its joints are those of the plan, in any order.
     """
     if isinstance(machine, Stance) or machine.robot.total_mass == 0:
         return []
@@ -433,16 +431,11 @@ def _ground_rows(machine: Standing, limits: Limits) -> list[tuple[str, Array, fl
     moment point (-reaction[1], reaction[0]) / reaction[5] satisfies linear conditions exactly if the reaction does.
     The cone of friction is replaced by an inscribed pyramid.
     """
-    zmp = limits.zmp
-    normals = machine.support.normals
-    offsets = (normals * machine.support.vertices).sum(axis=1) + (zmp.margin if isinstance(zmp, InFoot) else 0.0)
-    if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
-        normals, offsets = np.vstack([normals, np.eye(2), -np.eye(2)]), np.concatenate([offsets, low, -high])
-    rows = []
-    if not isinstance(zmp, Anywhere):
-        for (x, y), offset in zip(normals, offsets, strict=True):
-            rows.append(("zero moment point", np.array([-y, x, 0.0, 0.0, 0.0, offset]), 0.0))
+    zmp = limits.zmp if isinstance(limits.zmp, InFoot | IndexAtLeast | Anywhere) else InFoot()
+    rows = [
+        ("zero moment point", np.array([-y, x, 0.0, 0.0, 0.0, offset]), 0.0)
+        for (x, y), offset in zip(*foot_edges(machine, zmp), strict=True)
+    ]
     rows.append(("vertical force of the ground", np.array([0.0, 0, 0, 0, 0, -1]), -limits.least_force(machine)))
     if np.isfinite(limits.friction):
         most = limits.friction * np.cos(np.pi / PYRAMID_SIDES)

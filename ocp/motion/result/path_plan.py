@@ -1,10 +1,11 @@
-"""Plan that consists of straight motions in joint space, through tool poses or to a goal."""
+"""Plan that consists of straight motions in joint space through tool poses."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ SAVED = "cost that displacements would save"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
-    """Plan that consists of straight motions in joint space, through tool poses or to a goal.
+    """Plan that consists of straight motions in joint space through tool poses.
 
     A path has no times of its own. The plan passes it in the least time at constant joint rates between waypoints
     within the velocity limits; `ocp.joint_path` and `schedule` time it under further limits.
@@ -46,11 +47,10 @@ class PathPlan(Plan):
         machine: The arm.
         joints: Joint positions at the waypoints. Shape (N, n), rad or m.
         limits: Limits of the joints.
-        path_cost: Cost of the path, without reconfigurations.
         constraints: Collision scene; None without a collision check.
-        poses: Poses of the tip at the waypoints and largest displacements of the joints between them, or None.
+        poses: Poses of the tip at the waypoints, and largest displacements of the joints between them.
+        step_cost: Cost of the steps between waypoints.
         candidates, bound: As in `Plan`; the bound is that of any path with at most as many segments.
-        step_cost: Cost of the steps between waypoints; None if it is unknown.
         reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
             is not planned.
     """
@@ -58,21 +58,21 @@ class PathPlan(Plan):
     machine: FixedBase
     joints: Array
     limits: Limits
-    path_cost: float
-    constraints: ClearanceConstraints | None = None
-    poses: PathPoses | None = None
+    constraints: ClearanceConstraints | None
+    poses: PathPoses
+    step_cost: Homogeneous
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
     reconfigurations: tuple[int, ...] = ()
-    step_cost: Homogeneous | None = None
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Cost of the path; reconfigurations do not count."""
-        return self.path_cost
+        costs = self.step_cost.evaluate(np.diff(self.joints, axis=0), 1.0)
+        return float(np.delete(costs, list(self.reconfigurations)).sum())
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
@@ -87,7 +87,7 @@ class PathPlan(Plan):
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
         """Tool poses that the path must reach at the waypoints, in world."""
-        return () if self.poses is None else (Target(self.t, self.poses.positions, self.poses.rotations),)
+        return (Target(self.t, self.poses.positions, self.poses.rotations),)
 
     @property
     def t(self) -> Array:
@@ -158,7 +158,7 @@ class PathPlan(Plan):
         t, bounds = self.t, self.limits.bounds(self.machine)
         excess = np.maximum(self.joints - bounds.upper, bounds.lower - self.joints)
         findings = [_largest("joints beyond their limits", excess, STEP_TOLERANCE, t, self.names)]
-        findings += self._pose_findings(self.poses) if self.poses is not None else []
+        findings += self._pose_findings()
         clearance = self.clearance()
         findings += [] if clearance is None else [clearance_finding(clearance, CLEARANCE_TOLERANCE_M)]
         clearances = {} if clearance is None else {clearance.name: clearance}
@@ -169,8 +169,6 @@ class PathPlan(Plan):
 
     def _optimality(self) -> tuple[list[Finding], str]:
         """Return the finding on first-order optimality, and the reason why a local minimum is undetermined, or ""."""
-        if self.poses is None or self.step_cost is None:
-            return [], "the cost of its steps is unknown"
         scene = None if self.constraints is None else self.constraints.scene
         options: dict[str, Any] = {"bounds": self.limits.bounds(self.machine), "idle": self.joints[0], "scene": scene}
         problem = PathProblem.through_poses(self.machine, self.poses, self.step_cost, **options)
@@ -179,7 +177,7 @@ class PathPlan(Plan):
             optimality_of(self.joints[first : last + 1], problem.restrict(first, last))
             for first, last in zip(firsts, lasts, strict=True)
         ]
-        saved = sum(part[0] for part in parts) / max(self.path_cost, np.finfo(float).tiny)
+        saved = sum(part[0] for part in parts) / max(self.cost, np.finfo(float).tiny)
         undecided = "its cost may decrease to second order" if any(part[1] for part in parts) else ""
         return [Finding(SAVED, saved, RESOLVED_SHARE, verdict="optimal", note="relative, to first order")], undecided
 
@@ -187,9 +185,9 @@ class PathPlan(Plan):
     def _counts(self) -> str:
         return f"the best of {len(self.candidates)} paths"
 
-    def _pose_findings(self, poses: PathPoses) -> list[Finding]:
+    def _pose_findings(self) -> list[Finding]:
         """Return the audit findings about the largest pose errors and the joint step that exceeds its limit most."""
-        t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
+        t, poses, tips = self.t, self.poses, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
         rotations = scipy.spatial.transform.Rotation.from_quat(tips[:, [4, 5, 6, 3]])
         turns = rotations.inv() * scipy.spatial.transform.Rotation.from_matrix(poses.rotations)
@@ -216,13 +214,12 @@ class PathPlan(Plan):
         arguments = {"machine": self.machine, "limits": self.limits, "constraints": self.constraints}
         record = {
             "request": stored_request("", arguments),
-            "cost": self.path_cost,
             "bound": self.bound,
             "reconfigurations": list(self.reconfigurations),
             "candidates": [candidate.record() for candidate in self.candidates],
             "joints": self.joints,
-            "poses": None if self.poses is None else self.poses._asdict(),
-            "weights": None if self.step_cost is None else self.step_cost.weights,
+            "poses": self.poses._asdict(),
+            "weights": self.step_cost.weights,
             "timed": isinstance(self.step_cost, LargestMotion),
         }
         return record_arrays("path", record)
@@ -236,42 +233,36 @@ class PathPlan(Plan):
             machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
             if not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
                 raise TypeError(f"its machine is a {type(machine).__name__}, its limits a {type(limits).__name__}")
-            count, values = len(head["joints"]), _checked_values(head, machine.joint_size)
+            values = _checked_values(head, machine.joint_size)
+            joints, weights = values.pop("joints"), values.pop("weights")
             if constraints is not None and not isinstance(constraints, ClearanceConstraints):
                 raise TypeError(f"its collision scene is a {type(constraints).__name__}")
             if constraints is not None and constraints.scene.has_moving_obstacles:
                 raise ValueError("its obstacles move, though a path has no times")
             breaks = tuple(int(number) for number in head["reconfigurations"])
-            if not all(0 <= number < count - 1 for number in breaks):
+            if not all(0 <= number < len(joints) - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
-            weights = values.pop("weights", None)
             kind = LargestMotion if head["timed"] is True else PathLength
             candidates = tuple(Candidate.of_record(record, None) for record in head["candidates"])
             return cls(
                 machine=machine,
-                joints=values.pop("joints"),
-                poses=PathPoses(**values) if values else None,
+                joints=joints,
                 limits=limits,
-                path_cost=float(head["cost"]),
                 constraints=constraints,
+                poses=PathPoses(**values),
+                step_cost=kind(weights),
                 candidates=candidates,
                 bound=None if head["bound"] is None else float(head["bound"]),
                 reconfigurations=breaks,
-                step_cost=None if weights is None else kind(weights),
             )
 
 
 def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
-    """Return the joint positions and poses from a file; raise ValueError if their shapes do not fit the machine."""
-    count = len(head["joints"])
-    shapes: dict[str, tuple[int, ...]] = {"joints": (count, size)}
-    written = {"joints": head["joints"]}
-    if head["weights"] is not None:
-        shapes["weights"], written["weights"] = (size,), head["weights"]
-    if head["poses"] is not None:
-        shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (size,)}
-        written |= {name: head["poses"][name] for name in PathPoses._fields}
-    values = {name: np.asarray(value, dtype=float) for name, value in written.items()}
+    """Return joints, weights and poses from a file; raise ValueError if their shapes do not fit the machine."""
+    count, written = len(head["joints"]), {"joints": head["joints"], "weights": head["weights"], **head["poses"]}
+    shapes = {"joints": (count, size), "weights": (size,)}
+    shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (size,)}
+    values = {name: np.asarray(written[name], dtype=float) for name in shapes}
     wrong = [name for name, shape in shapes.items() if values[name].shape != shape]
     finite = all(np.isfinite(values[name]).all() for name in values if name != "step")
     if wrong or count < 2 or not finite:

@@ -6,8 +6,6 @@ waypoints (`path_plan`), or several plans one after the other (`segmented_plan`)
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from abc import ABC, abstractmethod
@@ -370,12 +368,9 @@ class Plan(ABC):
 
     def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
         """Write the `table` of the motion, with a row every `period` s, to a CSV file in full precision."""
-        columns = self.table(period)
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(table_head(self.names))
-        writer.writerows([repr(value) for value in row] for row in np.column_stack([*columns.values()]).tolist())
-        write_text(path, stream.getvalue())
+        rows = np.column_stack([*self.table(period).values()]).tolist()
+        lines = (table_head(self.names), *(map(repr, row) for row in rows))
+        write_text(path, "".join(f"{','.join(line)}\n" for line in lines))
 
     def to_ros(self, period: float = 0.01) -> dict[str, Any]:
         """Return the fields of trajectory_msgs/msg/JointTrajectory as a dictionary, sampled every `period` s."""
@@ -397,11 +392,8 @@ class Plan(ABC):
 def evaluate_parts(begins: Sequence[float], times: Array, width: int, evaluate: Callable[[int, Rows], Array]) -> Array:
     """Evaluate a quantity of a multi-part motion at times (M,), each in the part that contains it. Shape (M, width).
 
-    Args:
-        begins: Times at which the parts begin, in order, s. A time at which a part begins belongs to this part.
-        times: Times, s.
-        width: Number of entries of the quantity.
-        evaluate: Function of the number of a part and of the indices (K,) of the times in it. It returns (K, width).
+    The parts begin at the increasing times `begins`, which belong to them. `evaluate` takes the number of a part and
+    the indices (K,) of the times in it; it returns (K, width).
     """
     values, which = np.zeros((len(times), width)), segment_index([*begins, np.inf], times)
     for number in np.unique(which).tolist():
@@ -435,9 +427,7 @@ def reading_plan(path: str | os.PathLike[str]) -> Iterator[None]:
 def describe_ends(speeds: Array, names: Sequence[str], units: Sequence[str]) -> str:
     """Return a text about the fastest joints at the start and at the end of a motion, "" if all joints rest there.
 
-    Args:
-        speeds: Speeds of the joints at both ends, 0 at rest. Shape (2, n).
-        names, units: Names of the joints, and units of their positions.
+    The speeds (2, n) at both ends are 0 at rest. The units are those of the joints' positions.
     """
     fastest = [(verb, row, int(row.argmax())) for verb, row in zip(("starts", "ends"), speeds, strict=True)]
     texts = [f"{verb} at {row[k]:.3g} {units[k]}/s ({names[k]!r})" for verb, row, k in fastest if row[k] > 0]

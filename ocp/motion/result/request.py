@@ -142,8 +142,7 @@ def declared_motion(
 ) -> ToolMotion:
     """Declare the problem of a request, and store the request in the problem, so that files can rebuild the problem.
 
-    Args:
-        start, reference, constraints, actuation, relaxed: As in `ToolMotionSetup`.
+    The other arguments are fields of `ToolMotionSetup`.
     """
     options: dict[str, Any] = {
         "base": request.base,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from models import Machine
 from models.checks import Array
 from models.machines.machine import hold_joints
 from ocp.audit.audit import Audit
+from ocp.curves import gauss_points
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, ERRORS, PACE, SLOPES, START_ERRORS
 from ocp.motion.result.candidate import Candidate
@@ -30,7 +31,6 @@ from ocp.solution import Solution
 
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"  # name of the array whose presence marks the file of a plan with several phases
-PHASED_RATES = "velocities"  # name of the joint rates in the solution of a problem of several phases
 TARGET_TIMES = 401  # number of times at which a plan stores the target poses of its tasks
 
 
@@ -44,13 +44,10 @@ class Part(NamedTuple):
 
 def deviation_cost(solution: Solution, parts: Sequence[Part]) -> float:
     """Return the part of a solution's cost that penalises deviations of relaxed tasks from their targets."""
-    breaks = solution.control_interpolant.breaks
-    points, weights = np.polynomial.legendre.leggauss(len(solution.control_interpolant.nodes))
-    widths = np.diff(breaks)
-    fractions = breaks[:-1, None] + widths[:, None] * (points + 1) / 2
-    shares = (widths[:, None] * weights / 2).ravel()
+    curve = solution.control_interpolant
+    fractions, shares = (each.ravel() for each in gauss_points(curve.breaks, len(curve.nodes)))
     errors = {part.suffix: part.end - part.begin for part in parts if f"{ERRORS}{part.suffix}" in solution.controls}
-    sample = solution.at_fraction(np.clip(fractions.ravel(), 0.0, 1.0)) if errors else {}
+    sample = solution.at_fraction(np.clip(fractions, 0.0, 1.0)) if errors else {}
     total = sum(seconds * shares @ (sample[f"{ERRORS}{suffix}"] ** 2).sum(axis=1) for suffix, seconds in errors.items())
     starts = (values[-1] for name, values in solution.states.items() if name.startswith(START_ERRORS))
     return float(total + sum((values**2).sum() for values in starts)) / 2
@@ -95,27 +92,34 @@ class SolvedPlan(Plan):
         share = self.solution.t / self.solution.horizon
         return np.concatenate([part.begin + (part.end - part.begin) * share for part in self.parts])
 
-    def _values(self, name: str) -> Array:
-        if self.rate_name == SLOPES and name == "rates":
-            return self._of_all_joints(name, np.asarray(self.solution[SLOPES] / self.solution[PACE]))
-        own = self.rate_name if name == "rates" else name
-        return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
+    def _variable(self, name: str, part: Part) -> str:
+        """Return the name that a state or control of a part has in the solution."""
+        return name + part.suffix
 
-    def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Insert the values of the joints that stay at rest into joint values (M, m) of the solution."""
-        return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
+    def _values(self, name: str) -> Array:
+        values = {**self.solution.states, **self.solution.controls}
+        return np.concatenate([self._plan_values(name, part, values) for part in self.parts])
 
     def _values_at(self, name: str, times: Array) -> Array:
-        def values(part: Part, fraction: Array) -> Array:
+        def values(number: int, rows: Rows) -> Array:
+            part = self.parts[number]
+            fraction = self._fractions(part, times[rows])
             if name == "accelerations":
-                return self.accelerations(part, fraction)
-            sample = self.solution.at_fraction(fraction)
-            if name == "rates":
-                return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
-            return sample[name + part.suffix]
+                return self._of_all_joints(name, part, self.accelerations(part, fraction))
+            return self._plan_values(name, part, self.solution.at_fraction(fraction))
 
-        size = self.machine.base_size if name == "base" else self.machine.joint_size - len(self.held)
-        return self._of_all_joints(name, self._evaluate(times, size, values))
+        size = self.machine.base_size if name == "base" else self.machine.joint_size
+        return evaluate_parts(self._begins, times, size, values)
+
+    def _plan_values(self, name: str, part: Part, values: Mapping[str, Array]) -> Array:
+        """Return "joints", "rates" or "base" of a part of the plan from values of the solution, (M, m) by name."""
+        own = self.rate_name if name == "rates" else name
+        pace = values[PACE] if own == SLOPES else 1.0
+        return self._of_all_joints(name, part, values[self._variable(own, part)] / pace)
+
+    def _of_all_joints(self, name: str, part: Part, values: Array) -> Array:
+        """Insert the values of the joints that stay at rest into joint values (M, m) of a part of the solution."""
+        return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return for each part the solution, its suffix of variable names, and its times on the solution's clock."""
@@ -250,14 +254,14 @@ class SolvedPlan(Plan):
     def rate_name(self) -> str:
         """Name of the state or control in the solution that holds the joint rates."""
         names = {**self.solution.states, **self.solution.controls}
-        return next(name for name in RATES if name + self.parts[0].suffix in names)
+        return next(name for name in RATES if self._variable(name, self.parts[0]) in names)
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
         """Return the joint accelerations at fractions (M,) of a time interval (part) of the plan. Shape (M, m)."""
         sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
         name = self.rate_name + part.suffix
-        if "accelerations" + part.suffix in sample:
-            return sample["accelerations" + part.suffix]
+        if (accelerations := self._variable("accelerations", part)) in sample:
+            return sample[accelerations]
         slope = self._slope(name, fraction)
         if self.rate_name != SLOPES:
             return np.asarray(slope / duration)
@@ -288,15 +292,6 @@ class SolvedPlan(Plan):
         """Times at which the parts of the plan begin, s."""
         return [part.begin for part in self.parts]
 
-    def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate, at times (M,), a function of a part of the plan and of fractions of the horizon of this part."""
-        return evaluate_parts(
-            self._begins,
-            times,
-            size,
-            lambda number, rows: evaluate(self.parts[number], self._fractions(self.parts[number], times[rows])),
-        )
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PhasedPlan(SolvedPlan):
@@ -321,10 +316,6 @@ class PhasedPlan(SolvedPlan):
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 
     @cached_property
-    def _solutions(self) -> dict[str, Solution]:
-        return {name: self.solution.phase(name) for name in self.phases}
-
-    @cached_property
     def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
         """Indices of the first machine's joints in the joint vector of each phase, by phase name. Shape (n,) each."""
         orders = {}
@@ -333,25 +324,10 @@ class PhasedPlan(SolvedPlan):
             orders[name] = np.array([joints.index(joint) for joint in self.names], dtype=np.intp)
         return orders
 
-    @property
-    def t(self) -> Array:
-        """Times of the grids of all phases, s; the time at a junction of two phases occurs twice. Shape (M,)."""
-        return np.concatenate([part.begin + self._solutions[part.suffix].t for part in self.parts])
+    def _variable(self, name: str, part: Part) -> str:
+        return f"{part.suffix}.{name}"
 
-    def _values(self, name: str) -> Array:
-        own = PHASED_RATES if name == "rates" else name
-        return np.concatenate([self._in_order(part, name, self._solutions[part.suffix][own]) for part in self.parts])
-
-    def _values_at(self, name: str, times: Array) -> Array:
-        own = PHASED_RATES if name == "rates" else name
-        size = self.machine.base_size if name == "base" else self.machine.joint_size
-        return self._evaluate(
-            times,
-            size,
-            lambda part, fraction: self._in_order(part, name, self._solutions[part.suffix].at_fraction(fraction)[own]),
-        )
-
-    def _in_order(self, part: Part, name: str, values: Array) -> Array:
+    def _of_all_joints(self, name: str, part: Part, values: Array) -> Array:
         """Return joint values of a phase in the joint order of the first phase's machine."""
         return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
@@ -376,8 +352,8 @@ class PhasedPlan(SolvedPlan):
             raise ValueError(f"its parts {self.phases} are not the phases {tuple(times)} of its solution")
         if not all(np.allclose(times[part.suffix], part[:2], rtol=1e-9, atol=1e-12) for part in self.parts):
             raise ValueError(f"its parts {self.parts} do not fill the time of its solution one after the other")
-        for name, machine in zip(self.phases, self.machines, strict=True):
-            states = self._solutions[name].states
-            sizes = [states.get(each, np.zeros((0, 0))).shape[1] for each in ("joints", PHASED_RATES)]
+        for part, machine in zip(self.parts, self.machines, strict=True):
+            names = [self._variable(each, part) for each in ("joints", "velocities")]
+            sizes = [self.solution.states.get(each, np.zeros((0, 0))).shape[1] for each in names]
             if set(machine.robot.joint_names) != set(self.names) or sizes != [machine.joint_size] * 2:
-                raise ValueError(f"the solution has no joints and velocities of its machine in phase {name!r}")
+                raise ValueError(f"the solution has no joints and velocities of its machine in phase {part.suffix!r}")

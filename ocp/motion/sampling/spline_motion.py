@@ -34,6 +34,7 @@ import scipy
 
 from models.checks import Array
 from ocp.console import casadi_silenced, check_time, time_left
+from ocp.curves import gauss_points
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import (
     ConstantJerkMotion,
@@ -285,10 +286,8 @@ class _Search:
 
     def _residuals(self, order: int) -> tuple[int, Any]:
         """Return p, L such that |L c|^2 / T^p is an integrated squared derivative (control points c, duration T)."""
-        places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
-        width = np.diff(self.breaks)[:, None]
-        at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
-        basis = scipy.sparse.diags_array(np.sqrt((width * weights / 2).ravel())) @ self._values(at, order)
+        at, shares = (each.ravel() for each in gauss_points(self.breaks, self.degree - order + 1))
+        basis = scipy.sparse.diags_array(np.sqrt(shares)) @ self._values(at, order)
         joints = scipy.sparse.diags_array(np.sqrt(self.squares[order - 1]))
         return 2 * order - 1, scipy.sparse.kron(basis, joints, format="csr")
 

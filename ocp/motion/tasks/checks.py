@@ -69,13 +69,16 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     return positions, base_values
 
 
-def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
+def clip_to_limits(
+    machine: Machine, joints: Array, lower: Array, upper: Array, *, label: str, hint: str = "keep within them"
+) -> Array:
     """Clip joint positions or velocities (n,), nan where free, that exceed limits by no more than rounding errors.
 
     Raises:
         ProblemError: A joint is outside its limits; `label` names the values, and `hint` says what to do.
     """
-    for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
+    limits = joints.tolist(), lower.tolist(), upper.tolist()
+    for name, value, low, high in zip(machine.robot.joint_names, *limits, strict=True):
         size = high - low if np.isfinite(high - low) else max([1.0, *(abs(x) for x in (low, high) if np.isfinite(x))])
         if value < low - CHECKS.rounding * size or value > high + CHECKS.rounding * size:
             at, least, greatest = format_distinct(value, low, high)
@@ -97,11 +100,8 @@ def checked_tasks(
 ) -> None:
     """Raise ProblemError if the machine cannot perform the tasks, or if its tip is not at a task's target at the start.
 
-    Args:
-        equations: Equations of the tasks.
-        base, joints: Start configuration.
-        horizon: End of the tasks, s; 1 for tasks of a path parameter.
-        check_start: Whether the pose at the start is checked.
+    The horizon is the end of the tasks, s, or 1 for tasks of a path parameter. Without `check_start`, the poses at the
+    start are not compared.
     """
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
     rows = _equation_numbers(equations)
@@ -115,7 +115,9 @@ def checked_tasks(
         raise ProblemError(words, name="rows", value=unmoved)
     numeric = ca.Function("jacobian", [b, q], [jacobian])
     configurations = [joints, *np.random.default_rng(0).normal(size=(5, len(joints)))]
-    if not any(_has_full_rank(np.array(numeric(base, at))) for at in configurations):
+    jacobians = [np.array(numeric(base, at)) for at in configurations] if equations.size else []
+    ranks = [np.linalg.matrix_rank(each, rtol=1e-9) for each in jacobians if np.isfinite(each).all()]
+    if max(ranks, default=0) < equations.size:
         words = f"the {equations.size} rows of the task are linearly dependent in every configuration tried: they "
         words += "prescribe a motion twice or one that the machine cannot make; leave out rows"
         raise ProblemError(words, name="rows", value=rows)
@@ -203,14 +205,6 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
                 raise ProblemError(words, name="orientation", value=matrix, time=time)
 
 
-def _has_full_rank(jacobian: Array) -> bool:
-    """Return whether the rows of a Jacobian are linearly independent."""
-    if not jacobian.size:  # all tasks are cones
-        return True
-    values = np.linalg.svd(jacobian, compute_uv=False)
-    return bool(np.isfinite(values).all() and values[-1] > 1e-9 * values[0])
-
-
 def check_closed(equations: TaskEquations, horizon: float) -> None:
     """Raise ProblemError if a task's target pose, or the integral of its target velocity, does not end as it begins."""
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
@@ -291,8 +285,8 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
             if speeds[worst] > limit * (1 + CHECKS.closed):
                 words = f"at {times[worst]:.4g} s the task of {part.name!r} asks for {speeds[worst]:.4g} {unit}, but "
                 words += f"joints at the limits of their rates move it at {limit:.4g} {unit} at most; run it slower"
-                details: dict[str, Any] = {"value": float(speeds[worst]), "limit": limit, "time": float(times[worst])}
-                raise ProblemError(words, name=part.name, **details)
+                speed, time = float(speeds[worst]), float(times[worst])
+                raise ProblemError(words, name=part.name, value=speed, limit=limit, time=time)
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
@@ -302,7 +296,8 @@ def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
     for joint in chain:
         rate, revolute = float(rate_limits[machine.robot.joint_names.index(joint.name)]), joint.kind != "prismatic"
-        linear += rate * (_chain_length(machine, after[joint.name]) if revolute else 1.0)
+        length = chain_length(after[joint.name], machine.robot.tip_translation) if revolute else 1.0
+        linear += rate * length
         angular += rate if revolute else 0.0
     return linear, angular
 
@@ -319,10 +314,12 @@ def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
     return np.linalg.norm(linear, axis=0), np.linalg.norm(angular, axis=0)
 
 
-def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
-    """Return an upper bound of the length of a joint chain to the tip, m, with prismatic joints fully extended."""
-    length = float(np.linalg.norm(machine.robot.tip_translation))
-    length += sum(float(np.linalg.norm(joint.translation)) for joint in joints)
+def chain_length(joints: Sequence[Joint], point: Any) -> float:
+    """Return an upper bound of the distance, m, from the start of a joint chain to a point (3,) of its last link.
+
+    It is infinite if a prismatic joint has no limits.
+    """
+    length = sum(float(np.linalg.norm(offset)) for offset in (point, *(joint.translation for joint in joints)))
     return length + sum(max(abs(joint.lower), abs(joint.upper)) for joint in joints if joint.kind == "prismatic")
 
 
@@ -337,7 +334,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
         shoulder, rotation = shoulder + rotation @ joint.translation, rotation @ joint.rotation
     slides = [joint for joint in chain[: first + 1] if joint.kind == "prismatic"]
     slide_length = sum(max(abs(joint.lower), abs(joint.upper)) for joint in slides)
-    return shoulder, slide_length + _chain_length(machine, chain[first + 1 :])
+    return shoulder, slide_length + chain_length(chain[first + 1 :], robot.tip_translation)
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:

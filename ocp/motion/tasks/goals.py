@@ -32,25 +32,15 @@ class Start:
     velocity: Literal["rest", "free"] | Any = "rest"
 
     @classmethod
-    def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
+    def of(cls, value: Any, machine: Machine, *, known: bool = False) -> tuple[Start, Any, Array]:
         """Convert a start, joint positions or None to a `Start`; also return its joints (n,) or None, and its base.
 
         Raises:
-            ProblemError: As `checked_configuration`.
+            ProblemError: As `checked_configuration`; or the joints are None although they have to be `known`.
         """
         start = value if isinstance(value, cls) else cls(value)
-        base = checked_configuration(machine, np.zeros(machine.joint_size), start.base)[1]
-        joints = None if start.joints is None else checked_configuration(machine, start.joints, start.base)[0]
-        return start, joints, base
-
-    @classmethod
-    def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert joint positions, or a start with known joints, to a `Start`; also return its joints (n,) and base.
-
-        Raises:
-            ProblemError: The joint positions are missing; or as `checked_configuration`.
-        """
-        start = value if isinstance(value, cls) else cls(value)
+        if start.joints is None and not known:
+            return start, None, checked_configuration(machine, np.zeros(machine.joint_size), start.base)[1]
         return start, *checked_configuration(machine, start.joints, start.base)
 
 

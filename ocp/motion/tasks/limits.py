@@ -22,11 +22,6 @@ ROUNDING_M = 1e-9
 REFERENCE_SAMPLES = 201  # number of times at which a reference is checked
 
 
-def is_finite(value: Any) -> bool:
-    """Return whether a value is a single finite number."""
-    return bool(np.isfinite(real(value)))
-
-
 @dataclass(frozen=True)
 class InFoot:
     """Rule that the zero moment point stays inside the support polygon by a margin (m) of at least 0."""
@@ -56,7 +51,7 @@ class IndexAtLeast:
     value: float
 
     def __post_init__(self) -> None:
-        if not (is_finite(self.value) and self.value < 1):
+        if not (np.isfinite(real(self.value)) and self.value < 1):
             words = f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()"
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
@@ -122,8 +117,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a zero moment point rule constrains: inward normals n
-    (k, 2) and offsets o (k,), with n . point >= o inside.
+    """Return the edges of the region that a zero moment point rule allows: inward normals n (k, 2) and offsets o (k,),
+    with n . point >= o inside. Where a rule prescribes the point, they are those of the support in other directions.
     """
     normals = machine.support.normals
     offsets = (normals * machine.support.vertices).sum(axis=1)
@@ -131,16 +126,19 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
         return normals, offsets + zmp.margin
     open_edges = np.zeros(len(offsets), dtype=bool)
     if isinstance(zmp, IndexAtLeast):
-        corners = np.array(np.meshgrid(*np.transpose(zmp.region(machine)))).reshape(2, 4)
+        low, high = zmp.region(machine)
+        corners = np.array(np.meshgrid(*np.transpose([low, high]))).reshape(2, 4)
         open_edges = (normals @ corners).min(axis=1) < offsets
-    elif isinstance(zmp, Pinned | Following):
+        sides = np.vstack([np.eye(2), -np.eye(2)])
+        return np.vstack([sides, normals[open_edges]]), np.concatenate([low, -high, offsets[open_edges]])
+    if isinstance(zmp, Pinned | Following):
         directions = machine.moving_directions
         open_edges = np.abs(normals - normals @ directions.T @ directions).max(axis=1) > PARALLEL
     return normals[open_edges], offsets[open_edges]
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return those distances (k, 1), m, of a zero moment point (2, 1) from the support edges that are not constant.
+    """Return those distances (k, 1), m, of a zero moment point (2, 1) from `foot_edges` that are not constant.
     Raise ProblemError if a constant distance is negative. `external` states whether external wrenches act.
     """
     normals, offsets = foot_edges(machine, zmp)
@@ -151,25 +149,10 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
     for i in set(range(len(offsets))) - set(free):
         inside = float(ca.evalf(rows[i])) if external else float(normals[i] @ reachable - offsets[i])
         if inside < -ROUNDING_M:
-            words = f"the zero moment point is {-inside:.4g} m beyond an edge of the support, less its margin, in "
+            words = f"the zero moment point is {-inside:.4g} m outside the region that {type(zmp).__name__} allows, in "
             words += "every motion of the joints: move the foot below the machine"
             raise ProblemError(words, name="zero moment point", value=-inside, limit=0.0)
     return rows[free]
-
-
-def constrained_axes(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0: x, 1: y) of the zero moment point that are not constant, so that constraints must keep
-    them in the rectangle of `zmp`; raise ProblemError if a constant coordinate is outside of the rectangle.
-    """
-    rows = [i for i in (0, 1) if (external or i in machine.moving_axes) and ca.symvar(point[i])]
-    low, high = zmp.region(machine)
-    reachable = machine.nearest_reachable(machine.most_stable_point)
-    for i in {0, 1} - set(rows):
-        if not low[i] - ROUNDING_M <= reachable[i] <= high[i] + ROUNDING_M:
-            words = f"IndexAtLeast({zmp.value:g}): the zero moment point is at {'xy'[i]} = {reachable[i]:.4g} m in "
-            words += f"every motion, outside {low[i]:.4g} .. {high[i]:.4g} m: move the foot below the machine"
-            raise ProblemError(words, name="zero moment point", value=reachable[i], limit=(low[i], high[i]))
-    return rows
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:

@@ -12,9 +12,10 @@ from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import ModelError
-from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, real
+from models.checks import NOT_NUMBERS, Array, ArrayInput, real
 from models.paths.blends import rest_to_rest
 from models.paths.smooth_path import SmoothPath, exponential, path_function, turn_function
 from models.spatial import expression, rotation_from_quaternion
@@ -60,14 +61,11 @@ def pose_line(
     require.choice("pace", pace, ("constant", "rest"))
     require.positive("duration", duration)
     (rotation, origin), (turned, end) = (_pose(pose, name) for pose, name in ((first, "first"), (second, "second")))
-    change = rotation.T @ turned
-    axial = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
-    sine, cosine = float(np.linalg.norm(axial)) / 2, (float(np.trace(change)) - 1) / 2
-    angle = float(np.arctan2(sine, cosine))
+    vector = scipy.spatial.transform.Rotation.from_matrix(rotation.T @ turned).as_rotvec()
+    angle = float(np.linalg.norm(vector))
     if angle > MAX_ROTATION_RAD:
         words = f"the poses are {np.degrees(angle):.4g} deg apart: the sense of the turn is ambiguous"
         raise ProblemError(words, name="poses", value=angle, limit=MAX_ROTATION_RAD)
-    vector = axial / 2 * (angle / sine if sine > 0 else 1.0)
 
     def fraction(time: Any) -> Any:
         s = time / duration
@@ -220,17 +218,12 @@ def track_expression(
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
     value = _call_track(track, time - begin if begin else time, label) if callable(track) else track
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = list(value.ravel())
-    if isinstance(value, list | tuple) and any(isinstance(part, ca.SX | ca.MX) for part in value):
-        value = ca.vertcat(*value)
     expected = " or ".join(map(str, allowed))
-    if not isinstance(value, ca.SX | ca.MX | ca.DM):
-        try:
-            value = ca.DM(floats(value))
-        except NOT_NUMBERS as error:
-            words = f"{label} gives {value!r}, not numbers or expressions of shape {expected}"
-            raise ProblemError(words, name=label, value=value, limit=allowed) from error
+    try:
+        value = expression(value)
+    except ModelError as error:
+        words = f"{label} gives {value!r}, not numbers or expressions of shape {expected}"
+        raise ProblemError(words, name=label, value=value, limit=allowed) from error
     if value.shape not in allowed:
         hint = ": one entry for each row of the task" if label == "velocity" else ""
         words = f"{label} has shape {tuple(value.shape)}, expected {expected}{hint}"

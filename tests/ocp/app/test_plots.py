@@ -38,6 +38,8 @@ from ocp.motion.plan import Candidate, Reason, Rejection
 from ocp.motion.result.candidate import Stage
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.solved_plan import SolvedPlan
+from ocp.motion.search.lengths import PathLength
+from ocp.motion.search.shortening import PathPoses
 
 START = np.array([0.3, 0.7, 0.5])
 TASK = TipTask(rows=(3, 4), velocity=(-0.1, 0.05))
@@ -290,7 +292,8 @@ def test_failed_solutions_are_printed_without_cost() -> None:
 
 
 def test_errors_at_a_prompt_take_one_line() -> None:
-    path = PathPlan(arm(), np.zeros((400, 3)), Limits(), 2.0, bound=1.9)
+    poses = PathPoses(np.zeros((400, 3)), np.zeros((400, 3, 3)), np.ones(3))
+    path = PathPlan(arm(), np.zeros((400, 3)), Limits(), None, poses, PathLength(np.ones(3)), bound=1.9)
     audit = sprint().audit()
     results: list[Any] = [
         motion(),

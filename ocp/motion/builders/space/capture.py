@@ -35,7 +35,6 @@ from ocp.motion.builders.space.pair import (
     grasp_wrench,
     guess_approach,
     guess_braking,
-    guessed_horizon,
     motion_of,
     pair_momentum,
     require_capacity,
@@ -84,11 +83,7 @@ class Cone:
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a constraint function of a tip position, m, that is positive inside the cone. Shape (1, 1).
-
-        Args:
-            place: Position of the tip in the grasped frame. Shape (3, 1), m.
-        """
+        """Return a constraint function, positive inside the cone, of a tip position (3, 1) in the grasped frame, m."""
         from_apex = place + self.depth * ca.DM(self.direction)
         share = ca.fmin(ca.fmax((ca.sumsqr(place) / self.length**2 - 1) / 3, 0), 1)
         opened = share**2 * (3 - 2 * share)
@@ -179,7 +174,8 @@ def capture_problem(
     """
     own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost})
     second, first = own.declare_second_phase(None), own.approach(clearance_constraints)
-    guess_braking(second, own.pair, _end_of_guess(first))
+    guesses = (first.declared.states[name].guess for name in ("joints", "velocities", "base"))
+    guess_braking(second, own.pair, tuple(guess.values[-1] for guess in guesses))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
@@ -277,9 +273,7 @@ class _Capture:
     def checked(cls, chaser: FreeFloating, capture: Capture, start: Any, shared: Mapping[str, Any]) -> _Capture:
         target = require.instance("capture", capture, Capture).target
         robot = checked_pair(chaser, target)
-        begin, joints, base = Start.of(start, chaser)
-        if joints is None:
-            raise ProblemError("capture: start is missing; give the joints of the chaser", name="start")
+        begin, joints, base = Start.of(start, chaser, known=True)
         target_base = checked_configuration(target, np.zeros(0), capture.target_base)[1]
         configurations = {"base": base, "target_base": target_base, "joints": joints}
         momentum = np.array(ca.DM(pair_momentum(chaser, target, **configurations))).ravel()
@@ -381,14 +375,6 @@ class _Capture:
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
         place = (begin - center_of_mass(chaser.robot, joints, there))[:size] + drift * time
         return ca.vertcat(place, attitude)
-
-
-def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joint positions, joint velocities and base configuration at the end of an approach's initial guess."""
-    end = np.array([guessed_horizon(problem)])
-    guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
-    joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
-    return joints, rates, base
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:

@@ -25,8 +25,10 @@ from models.checks import Array
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
 from ocp.curves import rk4_step
+from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.dynamics import QUINTIC
+from ocp.motion.tasks.checks import chain_length
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 from ocp.problem.values import constant
@@ -95,7 +97,7 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
     return rate[3:6], rate[0:3] + cross(arm, rate[3:6])
 
 
-Guesses = dict[str, Any]  # functions of time by the names of states and controls
+Guesses = dict[str, Samples]  # by the names of states and controls
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating,
         gap, guesses = tracker.follow(times, path, joints, base)
         if gap < nearest:
             nearest = gap
-            set_guess(problem, duration, {**guesses, "target": _curve(times, bases)})
+            set_guess(problem, duration, {**guesses, "target": Samples(times, bases)})
         if gap < GUESS.tolerance:
             return
 
@@ -276,15 +278,10 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _guesses_of_motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Convert samples of joint positions, joint velocities and base configurations to guesses as functions of time."""
+    """Convert samples of joint positions, joint velocities and base configurations to guesses by name."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
-    return {name: _curve(times, samples) for name, samples in tables.items()}
-
-
-def _curve(times: Array, samples: Array) -> Any:
-    """Return the piecewise linear interpolant of samples as a function of time."""
-    return lambda t: np.column_stack([np.interp(t, times, column) for column in samples.T])
+    return {name: Samples(times, samples) for name, samples in tables.items()}
 
 
 def guessed_horizon(problem: Problem) -> float:
@@ -300,10 +297,7 @@ def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
     assert declared.horizon is not None
     if not declared.horizon.fixed:
         declared.horizon = replace(declared.horizon, guess=float(duration))
-    for name, guess in guesses.items():
-        for pool in (declared.states, declared.controls):
-            if name in pool:
-                pool[name] = replace(pool[name], guess=guess)
+    declared.set_guesses(guesses)
 
 
 ROUNDING = 1e-9  # rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s
@@ -391,17 +385,7 @@ def _relative_motion(chaser: FreeFloating, target: FreeFloating, start: State) -
 def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
     """Return an upper bound of the distance between both centres of mass when the tip is at the grasp, m."""
     robot, body = chaser.robot, target.robot
-    middle = sum(
-        link.mass * _longest_distance(robot, link.name, link.center_of_mass) for link in robot.links if link.mass
-    )
-    reach = _longest_distance(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
+    massive = [link for link in robot.links if link.mass]
+    moments = (link.mass * chain_length(robot.path_to(link.name), link.center_of_mass) for link in massive)
+    reach = chain_length(robot.path_to(robot.tip_link), robot.tip_translation) + sum(moments) / robot.total_mass
     return reach + float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
-
-
-def _longest_distance(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of the distance of a link's point from the root, m; inf with unlimited prismatic joints."""
-    length = float(np.linalg.norm(np.asarray(point, dtype=float)))
-    for joint in robot.path_to(link):
-        slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0
-        length += float(np.linalg.norm(joint.translation)) + slides
-    return length

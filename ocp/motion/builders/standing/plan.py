@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -192,16 +192,6 @@ Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 
-class Attempt(NamedTuple):
-    """Result of one solve: plan or last iterate, the error that rejects it, and whether the error reports only
-    violations of inequalities between the points of the grid.
-    """
-
-    solution: Solution | None
-    failure: SolveError | None = None
-    exceeded: bool = False
-
-
 @interruptible
 def solve_standing(
     machine: Standing,
@@ -269,7 +259,7 @@ def solve_steps(
     options: dict[str, Any] = {"cost": cost, "limits": limits}
     guess = guess_in_time(steps, start, options, solving.ipopt_options)
     options["start"] = start
-    judge = partial(_audited, solving.tolerances, lambda _: None)
+    judge = partial(_audited, solving.tolerances, lambda *_: None)
     trials: list[Trial] = [(None, solving.method or STEPS)]
     return _first_accepted(lambda _: steps_problem(steps, **options), trials, solving.ipopt_options, judge, guess)
 
@@ -285,7 +275,7 @@ def _first_accepted(
     declare: Callable[[Level | None], Problem],
     trials: Sequence[Trial],
     settings: Mapping[str, Any],
-    judge: Callable[..., Attempt],
+    judge: Callable[..., tuple[Solution | SolveError, bool]],
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
     """Try formulations and meshes in turn, and return the first plan that the audit accepts; raise SolveError or
@@ -305,10 +295,10 @@ def _first_accepted(
             continue
         diagnosed = guess is None and level == trials[-1][0]
         for name, attempt in _attempts(problem, mesh, settings, judge, guess, diagnosed=diagnosed):
-            if attempt.failure is None and attempt.solution is not None:
-                return attempt.solution
-            last, failure = attempt.solution or last, attempt.failure or failure
-            reasons.append(f"{label}{name}: {attempt.failure}")
+            if isinstance(attempt, Solution):
+                return attempt
+            last, failure = attempt.solution or last, attempt
+            reasons.append(f"{label}{name}: {attempt}")
     raise SolveError(
         "no standing plan passes its audit:\n" + "\n".join(reasons), last, failure.conflicts,
         name=failure.name, value=failure.value, limit=failure.limit, time=failure.time,
@@ -330,56 +320,60 @@ def _attempts(
     problem: Problem,
     mesh: Collocation | MultipleShooting,
     settings: Mapping[str, Any],
-    judge: Callable[..., Attempt],
+    judge: Callable[..., tuple[Solution | SolveError, bool]],
     guess: Solution | Mapping[str, Any] | None,
     *,
     diagnosed: bool,
-) -> Iterator[tuple[str, Attempt]]:
-    """Solve and audit a problem on finer and finer meshes; yield a name and the result of each solve.
+) -> Iterator[tuple[str, Solution | SolveError]]:
+    """Solve and audit a problem on finer and finer meshes; yield a name and the plan or the error of each solve.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
     for k in range(MESHES):
         name, first = f"{mesh.intervals} intervals", diagnosed and k == 0
-        attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
+        run = partial(solve, problem, mesh, options=settings, guess=guess, check=first)
+        attempt, exceeded = judge(name, problem, run)
         yield name, attempt
-        guess = attempt.solution
-        if attempt.solution is None or not attempt.solution.success or time_left() <= 0:
+        guess = attempt.solution if isinstance(attempt, SolveError) else attempt
+        if guess is None or not guess.success or time_left() <= 0:
             return
-        if attempt.exceeded:
+        if exceeded:
             tightened = partial(tighten, problem, mesh, options=settings, guess=guess)
-            yield f"{name}, tightened", judge(f"{name}, tightened", problem, tightened)
+            yield f"{name}, tightened", judge(f"{name}, tightened", problem, tightened)[0]
         mesh = mesh.halve()
 
 
 def _audited(
     tolerances: Mapping[str, float] | None,
-    pose_error: Callable[[Audit], SolveError | None],
+    pose_error: Callable[[Audit, Solution], SolveError | None],
     name: str,
     problem: Problem,
     run: Callable[[], Solution],
-) -> Attempt:
-    """Run a solver and audit the plan; `pose_error` rejects plans that pass but deviate from their tasks."""
+) -> tuple[Solution | SolveError, bool]:
+    """Run a solver and audit the plan; `pose_error` rejects plans that pass but deviate from their tasks.
+
+    Return the plan or the error, and whether only inequalities are violated, between the points of the grid.
+    """
     try:
         solution = run()
     except SolveError as error:
-        return Attempt(error.solution, error)
+        return error, False
     if not solution.success:
         if solution.status is SolverStatus.INTERRUPTED:
             raise SolveError(f"interrupted during the solve with {name}", solution, name=name)
-        ended = SolveError(f"ipopt ended with {solution.status}", name="ipopt", value=solution.message)
-        return Attempt(solution, ended)
+        ended = f"ipopt ended with {solution.status}"
+        return SolveError(ended, solution, name="ipopt", value=solution.message), False
     audit = solution.audit(tolerances=tolerances)
     if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
         if collision := collision_error(audit, solution):
             raise collision
         exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-        return Attempt(solution, audit_error(audit, solution), exceeded)
-    return Attempt(solution, pose_error(audit))
+        return audit_error(audit, solution), exceeded
+    return pose_error(audit, solution) or solution, False
 
 
 def _error_of_tips(
-    machine: Standing, tasks: TipTask | Sequence[TipTask], along_parameter: bool, audit: Audit
+    machine: Standing, tasks: TipTask | Sequence[TipTask], along_parameter: bool, audit: Audit, solution: Solution
 ) -> SolveError | None:
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""
     progress = audit.states["path"][:, 0] if along_parameter else audit.t
@@ -387,7 +381,7 @@ def _error_of_tips(
     gaps = bind(machine, tasks).by_row(lambda task: task.start_gap)
     if (errors > np.maximum(gaps, POSE_TOLERANCE)).any():
         words = f"a tip deviates from its task by {errors.max():.2g} (m or rad)"
-        return SolveError(words, name="tip", value=errors.max())
+        return SolveError(words, solution, name="tip", value=errors.max())
     return None
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from models.checks import Array
+from models.checks import Array, real
 from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
 from models.robot.dynamics import Wrench
 from models.robot.kinematics import joint_limit_index
@@ -34,19 +34,7 @@ from ocp.motion.builders.standing.start import (
 )
 from ocp.motion.tasks.checks import check_length, check_rest, checked_configuration, checked_tasks, rates_at_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import (
-    Following,
-    IndexAtLeast,
-    InFoot,
-    JointBounds,
-    Limits,
-    Pinned,
-    ZmpRule,
-    check_rule,
-    constrained_axes,
-    foot_rows,
-    is_finite,
-)
+from ocp.motion.tasks.limits import Following, InFoot, JointBounds, Limits, Pinned, ZmpRule, check_rule, foot_rows
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
@@ -134,7 +122,7 @@ class FreeTime:
 
     def __post_init__(self) -> None:
         times = (self.lower, self.guess, self.upper)
-        if not (all(map(is_finite, times)) and 0 < self.lower <= self.guess <= self.upper):
+        if not (np.isfinite([*map(real, times)]).all() and 0 < self.lower <= self.guess <= self.upper):
             message = "FreeTime: 0 < lower <= guess <= upper is needed, not " + ", ".join(map(repr, times))
             raise ProblemError(message, name="FreeTime", value=times)
 
@@ -157,9 +145,9 @@ def standing_problem(
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
     0, and the control "path_acceleration". The path constraints are "tip", see `StandingSetup.tip_level`; "zero moment
-    point", m, with InFoot the distance from the edges of the foot less the margin; "foot", the distance from edges that
-    another rule leaves open, m; "vertical force", N; "friction", squared friction limit less squared tangential force,
-    over the squared weight; and "torques". The guess is a local motion.
+    point", the distance from the edges of the region that `zmp` allows, or from a point that it prescribes, m; "foot",
+    the distance from other edges of the foot then, m; "vertical force", N; "friction", squared friction limit less
+    squared tangential force, over the squared weight; and "torques". The guess is a local motion.
 
     Args:
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
@@ -357,13 +345,11 @@ def _constrain_ground(
         reserve = ((limits.friction * force[2]) ** 2 - ca.sumsqr(force[:2])) / machine.weight**2
         problem.path("friction", reserve, lower=0)
     point = center_of_pressure(reaction)
-    if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
-        rows = constrained_axes(machine, zmp, point, bool(wrenches))
-        problem.path("zero moment point", point[rows], lower=low[rows], upper=high[rows], unit="m")
-    elif isinstance(zmp, Pinned | Following):
+    name = "zero moment point"
+    if isinstance(zmp, Pinned | Following):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
-        problem.path("zero moment point", gap, lower=0, upper=0, unit="m")
+        problem.path(name, gap, lower=0, upper=0, unit="m")
+        name = "foot"
     inside = foot_rows(machine, zmp, point, bool(wrenches))
     if inside.numel():
-        problem.path("zero moment point" if isinstance(zmp, InFoot) else "foot", inside, lower=0, unit="m")
+        problem.path(name, inside, lower=0, unit="m")

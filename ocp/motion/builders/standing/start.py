@@ -24,7 +24,7 @@ from ocp.errors import ProblemError
 from ocp.motion.local.accelerations import AccelerationOptions, resolve_accelerations
 from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned, ZmpRule, foot_edges
+from ocp.motion.tasks.limits import Following, JointBounds, Pinned, ZmpRule, foot_edges
 from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import on_symbols
 
@@ -49,8 +49,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    names = machine.robot.joint_names
-    return clip_to_limits(joints, lower, upper, label="start", names=names, hint="start inside them")
+    return clip_to_limits(machine, joints, lower, upper, label="start")
 
 
 def check_freedom(
@@ -107,7 +106,12 @@ def check_loads(
     ]
     rows.append((reaction[5] / least_force, 1.0, np.inf, f"the vertical force, at least {least_force:g} N"))
     scale = machine.weight * machine.support.half_widths.max()
-    for normal, offset in _edges(machine, zmp):
+    normals, offsets = foot_edges(machine, zmp)
+    if isinstance(zmp, Pinned | Following):
+        directions = machine.moving_directions
+        place = directions @ np.array(ca.DM(zmp.place(machine, ca.DM(0.0)))).ravel()
+        normals, offsets = np.vstack([normals, directions, -directions]), np.concatenate([offsets, place, -place])
+    for normal, offset in zip(normals, offsets, strict=True):
         moment = normal[0] * -reaction[1] + normal[1] * reaction[0] - offset * reaction[5]
         rows.append((moment / scale, 0.0, np.inf, "the place of the zero moment point"))
     values, low, high, names = zip(*rows, strict=True)
@@ -145,22 +149,6 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
     direction = slope / length if length > 0 else slope
     across = np.eye(len(slope)) - np.outer(direction, direction)
     return across @ jacobian, across @ wanted
-
-
-def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes that must contain the zero moment point, as inward normals and offsets, m."""
-    edges = list(zip(*foot_edges(machine, zmp), strict=True))
-    unit = np.eye(2)
-    if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
-    elif isinstance(zmp, Pinned | Following):
-        unit = machine.moving_directions
-        low = high = unit @ np.array(ca.DM(zmp.place(machine, ca.DM(0.0)))).ravel()
-    else:
-        return edges
-    for axis, least, greatest in zip(unit, low, high, strict=True):
-        edges += [(axis, float(least)), (-axis, -float(greatest))]
-    return edges
 
 
 def _least_violations(

@@ -454,7 +454,7 @@ def test_guesses_of_both_phases_conserve_the_momentum(request_of: Callable[[], d
         share = np.linspace(0.0, 1.0, 400)
         t = states[f"{name}.{DURATION}"].guess * share
         base, joints, rates = (
-            np.asarray(states[f"{name}.{each}"].guess(share)) for each in ("base", "joints", "velocities")
+            np.array([states[f"{name}.{each}"].guess(s) for s in share]) for each in ("base", "joints", "velocities")
         )
         b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
         moves = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)]).map(len(t))

@@ -106,8 +106,10 @@ def test_the_plan_avoids_an_obstacle_by_its_free_roll() -> None:
 
 
 def course(cost: Any, t: Any, **options: Any) -> Any:
-    known = {"lower": -np.inf, "upper": np.inf, "first_roll": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
-    return least_cost_roll(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
+    limits = options.pop("lower", -np.inf), options.pop("upper", np.inf)
+    first = options.pop("first_roll", None)
+    settings = RollSettings(**{"rate_weight": 1e-4, "acceleration_weight": 0.0, **options})
+    return least_cost_roll(lambda k, roll: cost(t[k], roll), t, limits, first_roll=first, settings=settings)
 
 
 def test_a_course_winds_as_often_as_it_pays() -> None:

@@ -90,7 +90,7 @@ def test_a_path_that_stands_still_has_times_that_increase() -> None:
     assert (np.diff(still.t) > 0).all()
     assert still.horizon < 1e-6
     assert (still["rates"] == 0).all()
-    assert replace(still, path_cost=0.0, bound=0.0).gap == 0.0
+    assert replace(still, bound=0.0).gap == 0.0
 
 
 # ---- audit -----------------------------------------------------------------------------------------------------------

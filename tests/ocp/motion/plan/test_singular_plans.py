@@ -189,9 +189,9 @@ def test_a_tool_that_turns_too_fast_names_joint_time_and_limit(angle: float, dur
 def test_values_beyond_a_limit_by_rounding_are_clipped_and_others_named(bound: tuple[float, float]) -> None:
     low, high = np.array([bound[0]]), np.array([bound[1]])
     size = bound[1] - bound[0] if np.isfinite(bound[0]) else 1.0
-    words: dict[str, Any] = {"label": "start", "names": ["a"], "hint": ""}
-    assert clip_to_limits(high + 0.5 * CHECKS.rounding * size, low, high, **words)[0] == bound[1]
-    with pytest.raises(ProblemError, match="'a' starts at") as caught:
-        clip_to_limits(high + 3 * CHECKS.rounding * size, low, high, **words)
+    pendulum = FixedBase(planar_chain([1.0], [1.0]))
+    assert clip_to_limits(pendulum, high + 0.5 * CHECKS.rounding * size, low, high, label="start")[0] == bound[1]
+    with pytest.raises(ProblemError, match="'joint1' starts at") as caught:
+        clip_to_limits(pendulum, high + 3 * CHECKS.rounding * size, low, high, label="start")
     shown = str(caught.value).split("starts at ")[1].split(",")[0]
     assert shown != f"{bound[1]:.6g}"

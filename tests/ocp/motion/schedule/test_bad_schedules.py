@@ -234,8 +234,6 @@ CASES = [
             "machine": INSTANCE,
             "plan": INSTANCE | {"one of them": (SAMPLES, None), "texts": (["a"], ["b"])},
             "path": INSTANCE,
-            "samples": COUNT | NOTHING | {"few": 12},
-            "names": {"number": 3, "one": ("a",)},
         },
     ),
     Case(
