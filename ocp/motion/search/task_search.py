@@ -209,7 +209,7 @@ class TaskSearch:
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
-        """Search again with more time samples where the path is near a limit or `everywhere`; return whether any is added."""
+        """Add time samples near limits of the best path (or `everywhere`) and search again; return whether any is added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
