@@ -141,19 +141,16 @@ class AccessoryProblem:
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
     @property
-    def cost_scale(self) -> float:
-        """Second-order change of the cost if states and controls change by their characteristic sizes.
+    def negligible_cost(self) -> float:
+        """Largest cost that counts as zero, because a plan does not resolve cost changes of this size reliably.
 
-        Changes of states change the running and the terminal cost; changes of controls, the Hamiltonian.
+        It is a share of the change of the cost, to second order, if states and controls change by their characteristic
+        sizes. Changes of states change the running and the terminal cost; changes of controls, the Hamiltonian.
         """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
-        return float(total + np.abs(np.diag(self.along.final_yy)[:-1]) @ np.tile(sizes.state, 2) ** 2) / 2
-
-    @property
-    def negligible_cost(self) -> float:
-        """Largest cost that counts as zero, because a plan does not resolve cost changes of this size reliably."""
-        return max(LIMIT_SHARE * self.cost_scale, LIMIT_SHARE**2 * self.along.slope_size)
+        total += np.abs(np.diag(self.along.final_yy)[:-1]) @ np.tile(sizes.state, 2) ** 2
+        return max(LIMIT_SHARE * float(total) / 2, LIMIT_SHARE**2 * self.along.slope_size)
 
     @property
     def control_scale(self) -> float:

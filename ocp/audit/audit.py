@@ -171,10 +171,8 @@ class Audit:
                     limit = "" if f.limit is None else f"{f.limit:.2e}"
                     time = "" if f.time is None else f"{f.time:.4f}"
                     ok = "" if f.limit is None else "ok" if f.passed else "FAILED"
-                    line = (
-                        f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}  {ok:<6}  {f.note}"
-                    )
-                    lines.append(line.rstrip())
+                    line = f"  {f.name:<{width}}  {f.value:>10.2e}  {limit:>10}  {f.unit:<6}  {time:>8}"
+                    lines.append(f"{line}  {ok:<6}  {f.note}".rstrip())
         return "\n".join([*lines, f"The plan {self.sentence}."])
 
 
@@ -311,6 +309,7 @@ def optimality_findings(
     that the plan over-reports.
     """
     cost, errors = optimum.cost_size, optimum.error_size
+    between = optimum.adjoint.between / errors
     share = float(optimum.lost.sum()) / cost + excess
     if costates is None:
         costates = max(COSTATE_SHARE, optimum.costate_accuracy)
@@ -319,9 +318,7 @@ def optimality_findings(
         Finding(COST_LOST, share, lost, None, f"{optimum.lost.sum():.3g} of the cost"),
         Finding("costate equation, relative", optimum.adjoint.total / errors, costates),
         Finding("costates beside the best, relative", optimum.costate_error, best_costates),
-        _worst(
-            "costates between the nodes, relative", optimum.adjoint.between / errors, optimum.adjoint.t[:-1], costates
-        ),
+        _worst("costates between the nodes, relative", between, optimum.adjoint.t[:-1], costates),
         Finding("transversality, relative", optimum.adjoint.ends.transversality / errors, costates),
     ]
     if form.horizon_is_free:

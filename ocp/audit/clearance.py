@@ -323,10 +323,7 @@ class _Search:
         return self._closest(self.best)
 
     def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
-        """Return, for each pair, the closest approach found so far, together with a given lower bound of the distance.
-
-        ``bounds`` are the lower bounds, m. Shape (n,).
-        """
+        """Return the closest approach of each pair found so far, with given lower bounds (n,) of the distances, m."""
         rotations, positions = self.track.frames(self.when)
         each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]

@@ -351,11 +351,10 @@ def optimality(along: Linearisation, allowed: float = LIMIT_SHARE) -> Optimality
     curved = _control_curvature(along)
     first = adjoint(along, curved, cost)
     if first.node_shifts.any():
-        candidate, loss = first, _loss_of_fit(along, first, curved)
+        loss = _loss_of_fit(along, first, curved)
         for _ in range(4):  # each pass resolves atoms at single nodes better by the width of an interval
-            candidate = adjoint(along, curved, cost, candidate.node_shifts)
-            new_loss = _loss_of_fit(along, candidate, curved)
-            if new_loss >= loss:
+            candidate = adjoint(along, curved, cost, first.node_shifts)
+            if (new_loss := _loss_of_fit(along, candidate, curved)) >= loss:
                 break
             first, loss = candidate, new_loss
     accessory = AccessoryProblem(along, first)

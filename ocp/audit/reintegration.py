@@ -129,8 +129,7 @@ def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> Integr
     places = np.linspace(0.0, 1.0, cells + 1)[1:].tolist()
     integrate = integrator("stiff", dae, places, tolerance=SETTINGS.tolerance, smooth=False)
     data = _control_columns(along.solution)
-    motions: list[np.ndarray] = []
-    costs: list[float] = []
+    motions: list[tuple[np.ndarray, float]] = []
     for chained in (False, True):
         values, cost = np.empty((len(starts), cells + 1, form.nx)), 0.0
         for k, inputs in enumerate(data):
@@ -141,9 +140,9 @@ def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> Integr
                 return None
             values[k, 1:] = result["xf"].full().T * unit
             cost += float(result["qf"][-1])
-        motions.append(values)
-        costs.append(cost)
-    return IntegratedMotion(motions[0], motions[1], costs[0], costs[1])
+        motions.append((values, cost))
+    (local, local_cost), (states, cost) = motions
+    return IntegratedMotion(local, states, local_cost, cost)
 
 
 def _worst(values: np.ndarray) -> np.ndarray:

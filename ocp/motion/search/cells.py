@@ -271,10 +271,8 @@ class _CellPass:
         best = self._best_of_cells(base, layer.joints[parents] + step * rates / root, cost, resize=True)
         parents, rates = parents[best], rates[best]
         start_base, start_joints = layer.base[parents], layer.joints[parents]
-        states = start_base, start_joints, task.select(parents)
-        base, joints, error = kinematics.step(
-            *states, rates, interval=(layer.time, time), tolerance=REACH_TOLERANCE / 10
-        )
+        states = start_base, start_joints, task.select(parents), rates
+        base, joints, error = kinematics.step(*states, interval=(layer.time, time), tolerance=REACH_TOLERANCE / 10)
         cost = layer.cost[parents] + ((root * (joints - start_joints)) ** 2).sum(axis=1) / (2 * step)
         displacement = np.abs(joints - start_joints)[:, self._effective].max(axis=1, initial=0.0)
         valid = np.isfinite(base).all(axis=1) & (displacement <= self._settings.longest)
@@ -389,13 +387,10 @@ class _CellPass:
         for begin, end in zip(self._stretch_layers, ends, strict=True):
             # a correction where new tasks begin belongs to their stretch
             last = end - 1 if end < len(layers) - 1 and layers[end].time == layers[end - 1].time else end
-            motions.append(self._local_motion(layers[begin : last + 1], paths[begin : last + 1, chosen]))
+            part, rows = layers[begin : last + 1], paths[begin : last + 1, chosen]
+            times = np.array([layer.time for layer in part])
+            base = np.stack([layer.base[row] for layer, row in zip(part, rows, strict=True)], axis=1)
+            joints = np.stack([layer.joints[row] for layer, row in zip(part, rows, strict=True)], axis=1)
+            joints = np.clip(joints, request.bounds.lower, request.bounds.upper)
+            motions.append(LocalMotion.through(times, base, joints, request.weights))
         return motions
-
-    def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return K motions; `paths` (L, K) has the indices of their states among the states at each of L times."""
-        times = np.array([layer.time for layer in layers])
-        base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
-        joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
-        joints = np.clip(joints, self.request.bounds.lower, self.request.bounds.upper)
-        return LocalMotion.through(times, base, joints, self.request.weights)

@@ -359,10 +359,8 @@ class SelfMotionManifolds:
             valid &= shift <= 2 * self.settings.flatness[charts.tangents.shape[2]] * edges.radii
             chosen = np.flatnonzero(valid)
             chosen = chosen[self._thin_out(edges.layer[chosen], joints[chosen], edges.radii[chosen])]
-            like = charts.tangents[edges.owners[chosen]]
-            added, added_edges = self._new_charts(
-                edges.layer[chosen], joints[chosen], np.minimum(2 * edges.radii[chosen], radius), like, len(charts)
-            )
+            radii, like = np.minimum(2 * edges.radii[chosen], radius), charts.tangents[edges.owners[chosen]]
+            added, added_edges = self._new_charts(edges.layer[chosen], joints[chosen], radii, like, len(charts))
             halved = edges.radii / 2
             charts = concatenate([charts, added])
             if len(charts) > max_charts:
@@ -490,9 +488,7 @@ def _rim(r: int) -> Array:
 
 def _solve_normal_equations(square: Array, right: Array) -> Array:
     """Solve K systems of normal equations (K, m, m) for right-hand sides (K, m), regularised against singularity."""
-    m = square.shape[1]
-    if not m:
-        return right
     trace = np.trace(square, axis1=1, axis2=2)[:, None, None]
     regularization = ROUNDING_SHARE**2 * trace + np.finfo(float).tiny
-    return np.asarray(np.linalg.solve(square + regularization * np.eye(m), right[:, :, None])[:, :, 0])
+    regular = square + regularization * np.eye(square.shape[1])
+    return np.asarray(np.linalg.solve(regular, right[:, :, None])[:, :, 0])

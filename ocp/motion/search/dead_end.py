@@ -281,43 +281,33 @@ def _fine_charts(search: AtlasSearch) -> list[Charts]:
 def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
     """Return the different constraints that stop motions at the last reached time sample, by rising violation."""
     space, scene, last = search.space, search.scene, front.last
-    names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
+    joints, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, targets, converged = _continuations(search, front)
-    sample, clearance = search.samples[next_sample], 0.0 if scene is None else scene.clearance
+    sample = search.samples[next_sample]
     errors = sample.manifolds.linearize(np.full(len(targets), sample.row), targets)[0]
     pose_errors = np.where(converged, 0.0, np.abs(errors).max(axis=1))
-    limits = search.limits[last] if last >= 0 else np.full(n, np.inf)
-    distances = np.full((len(targets), 1), np.inf)
+    steps = search.limits[last] if last >= 0 else np.full(n, np.inf)
+    # one column for each constraint
+    kinds = [ObstructionKind.REACH, *[ObstructionKind.LIMIT] * (2 * n), *[ObstructionKind.STEP] * n]
+    names, signs = ["tip", *joints, *joints, *joints], np.repeat([1.0, -1.0, 1.0], [1 + n, n, n])
+    values = np.column_stack([pose_errors, targets, targets, np.abs(targets - before)])
+    limits = np.concatenate([np.zeros(1), space.upper, space.lower, steps])
     if scene is not None:
-        distances = distances_along(scene, np.zeros(0), targets, search.times[next_sample], cutoff=clearance)
-    displacements = np.abs(targets - before)
-    over, under = targets - space.upper, space.lower - targets
-    excess = np.column_stack([pose_errors, over, under, displacements - limits, clearance - distances])
+        distances = distances_along(scene, np.zeros(0), targets, search.times[next_sample], cutoff=scene.clearance)
+        kinds += [ObstructionKind.COLLISION] * len(scene.pairs)
+        names += [" and ".join(bodies) for bodies in scene.labels]
+        values, signs = np.hstack([values, distances]), np.append(signs, np.full(len(scene.pairs), -1.0))
+        limits = np.append(limits, np.full(len(scene.pairs), scene.clearance))
+    excess = signs * (values - limits)
     excess[~converged, 1:] = 0.0
     worst = excess.argmax(axis=1)
     largest = excess[np.arange(len(worst)), worst]
-
-    def obstruction_of(row: int) -> Obstruction:
-        """Return the obstruction of one attempted step, which is the most violated constraint of the step."""
-        kind, joint = divmod(int(worst[row]) - 1, n)
-        current, target = before[row], targets[row]
-        if worst[row] == 0:
-            return Obstruction(ObstructionKind.REACH, "tip", float(pose_errors[row]), 0.0, current, target)
-        if kind < 2:
-            bound = float((space.upper, space.lower)[kind][joint])
-            return Obstruction(ObstructionKind.LIMIT, names[joint], float(target[joint]), bound, current, target)
-        if kind == 2:
-            step, largest_step = float(displacements[row, joint]), float(limits[joint])
-            return Obstruction(ObstructionKind.STEP, names[joint], step, largest_step, current, target)
-        assert scene is not None
-        pair = int(worst[row]) - 1 - 3 * n
-        bodies = " and ".join(scene.labels[pair])
-        return Obstruction(ObstructionKind.COLLISION, bodies, float(distances[row, pair]), clearance, current, target)
-
     smallest: dict[tuple[ObstructionKind, str], Obstruction] = {}
     for row in np.argsort(largest, kind="stable").tolist():
         if largest[row] > TOLERANCE:
-            entry = obstruction_of(row)
+            column = int(worst[row])
+            value, limit = float(values[row, column]), float(limits[column])
+            entry = Obstruction(kinds[column], names[column], value, limit, before[row], targets[row])
             smallest.setdefault((entry.kind, entry.name), entry)
     if not smallest:  # there are configurations at the next sample, but no propagated path reaches them
         charts = front.layers[next_sample].centers

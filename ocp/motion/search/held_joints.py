@@ -184,9 +184,8 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
         return start_collisions(request, np.where(ignorable, values, configurations)).count(None)
 
     if ignorable.any() and not clear_count(start):
-        samples = sample_starts(
-            request.machine, bounds.lower, bounds.upper, request.settings.ik_starts, seed=request.seed
-        )
+        count, seed = request.settings.ik_starts, request.seed
+        samples = sample_starts(request.machine, bounds.lower, bounds.upper, count, seed=seed)
         start[ignorable] = max((start, *configurations, *samples), key=clear_count)[ignorable]
     return start, np.where(ignorable, start, configurations)
 

@@ -112,9 +112,8 @@ class Homogeneous(StepCost):
         end = np.einsum("pnr,pn->pr", target.tangents, multiplier) + after.slope
         curve = -np.maximum(-lowest_eigenvalue(after.curve), 0.0)
         extent = np.maximum(np.abs(target.low), np.abs(target.high))
-        least = sum(
-            np.minimum(slope * box.low, slope * box.high).sum(axis=1) for slope, box in ((start, source), (end, target))
-        )
+        slopes = (start, source), (end, target)
+        least = sum(np.minimum(slope * box.low, slope * box.high).sum(axis=1) for slope, box in slopes)
         loss = (np.abs(multiplier) * (source.max_deviation + target.max_deviation)).sum(axis=1)
         least = least + (multiplier * delta).sum(axis=1) + curve * (extent**2).sum(axis=1) / 2
         return np.asarray(after.least + least - loss)

@@ -78,8 +78,6 @@ class TaskKinematics(NamedTuple):
 
     def least_rates(self, required: Array) -> Array:
         """Return the least-norm scaled joint rates (K, n) that cause required rates of the task coordinates (K, m)."""
-        if not required.shape[1]:
-            return np.zeros(self.null.shape[:2])
         return np.asarray(self.row_space @ np.linalg.solve(self.lower, required[:, :, None]))[:, :, 0]
 
     def null_rates(self, rates: Array) -> Array:
@@ -253,10 +251,8 @@ def limit_rates(
         below = rates[active, worst] < lower[active, worst]
         limit = np.where(below, lower[active, worst], upper[active, worst])
         is_rate_limit = np.abs(limit) >= max_rates[worst]
-        violations[active, 0], violations[active, 1] = (
-            worst,
-            np.where(below, LimitSide.LOW, LimitSide.HIGH) + np.where(is_rate_limit, LimitSide.SLOW, LimitSide.LOW),
-        )
+        side = np.where(below, LimitSide.LOW, LimitSide.HIGH) + np.where(is_rate_limit, LimitSide.SLOW, LimitSide.LOW)
+        violations[active] = np.column_stack([worst, side])
         directions = null[active, worst]
         leverage = (directions**2).sum(axis=1)
         change = (limit - rates[active, worst]) / np.maximum(leverage, ROUNDING_SHARE)
@@ -322,9 +318,8 @@ def check_floating_reach(
         base_then = _base_about_center_of_mass(machine, base, start, z, time)
         residual = equations.pose_residual(base_then, z[:n], ca.SX(ca.DM(targets)))
         function = ca.Function("pose_residual", [z], [residual, ca.densify(ca.jacobian(residual, z))], {"cse": True})
-        candidates, errors = gauss_newton(
-            function, np.vstack([solutions, starts]), *limits, tolerance=REACH_TOLERANCE, iterations=100
-        )
+        guesses = np.vstack([solutions, starts])
+        candidates, errors = gauss_newton(function, guesses, *limits, tolerance=REACH_TOLERANCE, iterations=100)
         reached = errors <= REACH_TOLERANCE
         if reached.any():
             solutions = candidates[reached][:STARTS]

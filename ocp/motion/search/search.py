@@ -298,7 +298,13 @@ class AtlasSearch:
         seconds = np.diff(self.times)[:, None]
         largest_step_cost = float(self.cost.evaluate(np.minimum(self.limits, MAX_STEP), seconds).max(initial=0.0))
         while True:
-            path, bound = self._solve(max_cost)
+            layers, path = self.find_path(max_cost)
+            bound = np.inf
+            if path is not None:
+                path, bound = self._branch_and_bound(layers, max_cost, self.path_cost(path), path)
+            elif layers:
+                graph = self.graph(layers, max_cost)
+                bound = max(float(graph.minima(graph.cost_to_go()[0], 0).min()), 0.0)
             if max_cost >= largest_step_cost:
                 return path, bound
             # a motion with an excluded step costs more than `max_cost`
@@ -311,16 +317,6 @@ class AtlasSearch:
     def gap(self) -> float:
         """Relative gap between the cost of the path and the lower bound at which the search stops."""
         return self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
-
-    def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return the best path without steps costlier than `max_cost`, and a lower cost bound of any such path."""
-        layers, best_path = self.find_path(max_cost)
-        if not layers:
-            return None, np.inf
-        if best_path is None:
-            graph = self.graph(layers, max_cost)
-            return None, max(float(graph.minima(graph.cost_to_go()[0], 0).min()), 0.0)
-        return self._branch_and_bound(layers, max_cost, self.path_cost(best_path), best_path)
 
     def lower_bound(self, known_cost: float) -> float:
         """Return a lower bound of the cost of any path, at most (1 - `gap`) times `known_cost`.
@@ -357,10 +353,8 @@ class AtlasSearch:
             if coarse:
                 self._cost_bounds, coarse = (graph, cost_to_go, cost_to_come), False
             through = [graph.cost_through(cost_to_come, cost_to_go, k) for k in range(len(layers))]
-            before, after = (
-                np.array([graph.minima(each, k).min() for k, each in enumerate(bounds)])
-                for bounds in (cost_to_come, cost_to_go)
-            )
+            before = np.array([graph.minima(values, k).min() for k, values in enumerate(cost_to_come)])
+            after = np.array([graph.minima(values, k).min() for k, values in enumerate(cost_to_go)])
             remaining = np.maximum(remaining, before[:-1] + after[1:])
             promising = [np.flatnonzero(total < target * best_cost) for total in through]
             if not all(len(rows) for rows in promising):

@@ -113,8 +113,8 @@ class TaskSearch:
                 words += f"{', '.join(machine.robot.joint_names)}{held}; search='segments' supports at most "
                 words += f"{MAX_FREE_DIRECTIONS}. Lock a joint with lock_joints(robot, {{NAME: POSITION}}), add rows "
                 words += "or a task, or use search='configurations'"
-                details: dict[str, Any] = {"value": free_directions, "limit": MAX_FREE_DIRECTIONS}
-                raise ProblemError(words, name="search", **details, time=stretch.begin)
+                count, limit = free_directions, MAX_FREE_DIRECTIONS
+                raise ProblemError(words, name="search", value=count, limit=limit, time=stretch.begin)
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
             lost = settings.lost[max(free_directions, 0)]
             joints, periodic = motion.joints[best], self.space.periodic
@@ -138,7 +138,8 @@ class TaskSearch:
     def _build_search(self, times: list[Array]) -> None:
         """Build the manifold atlas at time samples; `times` has an array for each time interval with active tasks."""
         request, samples = self.request, list[TimeSample]()
-        for equations, stretch_times in zip(self._equations, times, strict=True):
+        active = [stretch.equations for stretch in request.stretches if stretch.equations is not None]
+        for equations, stretch_times in zip(active, times, strict=True):
             manifolds = self._manifolds(equations, stretch_times)
             samples += [TimeSample(manifolds, index) for index in range(len(stretch_times))]
         self._samples, self._times_by_stretch, self.times = samples, times, np.concatenate(times)
@@ -152,10 +153,6 @@ class TaskSearch:
         """Return the self-motion manifolds of tasks at given times (M,), s."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
         return SelfMotionManifolds(self.space, equations, targets)
-
-    @property
-    def _equations(self) -> list[TaskEquations]:
-        return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
         """Return an error that says where all motions end, and why; None if a motion to the end was found."""
@@ -212,11 +209,7 @@ class TaskSearch:
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
-        """Add time samples where the best path is near a limit (or `everywhere`), and search again.
-
-        Returns:
-            Whether time samples were added.
-        """
+        """Add time samples near limits of the best path (or `everywhere`) and search again; return whether any is added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path

@@ -203,9 +203,8 @@ class ChartGraph:
             ends = self.curved[k].select(i), self.curved[neighbour].select(j)
             steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds=seconds)
             if known_bounds is not None:
-                affordable = np.flatnonzero(
-                    _bound_with_rest(steps, source.select(i), known_bounds.select(i)) < max_cost
-                )
+                totals = _bound_with_rest(steps, source.select(i), known_bounds.select(i))
+                affordable = np.flatnonzero(totals < max_cost)
                 i, steps = i[affordable], steps.select(affordable)
             if not i.size:
                 continue
