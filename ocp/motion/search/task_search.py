@@ -209,7 +209,7 @@ class TaskSearch:
         return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
 
     def refine_samples(self, everywhere: bool = False) -> bool:
-        """Add time samples near limits of the best path (or `everywhere`) and search again; return whether any is added."""
+        """Add samples near limits of the best path (or `everywhere`) and search again; return whether any was added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
