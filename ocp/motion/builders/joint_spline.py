@@ -146,9 +146,8 @@ def joint_path(machine: Machine, plan: Any, path: PathLike) -> PlannedJoints:
         ProblemError: The plan has no joints, or its tasks do not run along the path; the samples have
             other shapes, are too few, do not increase, or do not reach both ends.
     """
-    for attribute in ("robot", "joint_size"):
-        if isinstance(machine, type) or not hasattr(machine, attribute):
-            raise ProblemError(f"{machine!r} is no machine; it has no {attribute}", name="machine", value=machine)
+    if isinstance(machine, type) or not (hasattr(machine, "robot") and hasattr(machine, "joint_size")):
+        raise ProblemError(f"{machine!r} is no machine with a robot and joints", name="machine", value=machine)
     length = getattr(path, "length", None)
     if not isinstance(length, float | int) or not length > 0:
         raise ProblemError(f"the path {path!r} has no length", name="path", value=path)

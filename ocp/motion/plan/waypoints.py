@@ -156,7 +156,7 @@ class _WaypointPlanner:
         self.positions, self.rotations, self.step = self.poses
         self.scene = None if self.constraints is None else self.constraints.scene
         self.lower, self.upper = bounds.lower, bounds.upper
-        pose = bind(machine, self._task(0))
+        pose = bind(machine, TipTask(position=self.positions[0], orientation=self.rotations[0]))
         idle = idle_positions(self.lower, self.upper)
         options: dict[str, Any] = {"bounds": bounds, "idle": idle, "scene": self.scene}
         self.problem = PathProblem.through_poses(machine, self.poses, self.cost, **options)
@@ -366,9 +366,6 @@ class _WaypointPlanner:
         joints = np.concatenate(paths)
         steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
         return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)
-
-    def _task(self, number: int) -> TipTask:
-        return TipTask(position=self.positions[number], orientation=self.rotations[number])
 
     def _seeds(self, number: int) -> Array:
         """Return inverse kinematics solutions at a waypoint, computed at most once for each waypoint."""
