@@ -210,9 +210,8 @@ class Newton:
                 return None
             if _is_same_set(next_sides, sides):
                 v, lam, p = root.variables, root.multipliers, arguments["p"]
-                if (
-                    self._matrix(v, p, lam, _fixed_entries(sides, arguments), scales, local=True) is None
-                ):  # a saddle point
+                which = _fixed_entries(sides, arguments)
+                if self._matrix(v, p, lam, which, scales, local=True) is None:  # a saddle point
                     return None
                 return replace(root, iterations=steps, seconds=time.monotonic() - began)
             sides = next_sides
@@ -275,9 +274,8 @@ class Newton:
         fixed, held = which
         free = np.where(fixed, 0.0, a)
         curvature = self._program.numbers.second(v, p, 1.0 / c, lam / c).data * free[self._first] * free[self._second]
-        slopes = (
-            self._program.numbers.first(v, p)[1].data * np.where(held, 1.0 / b, 0.0)[self._row] * free[self._column]
-        )
+        of_held = np.where(held, 1.0 / b, 0.0)[self._row]
+        slopes = self._program.numbers.first(v, p)[1].data * of_held * free[self._column]
         if not np.all(np.isfinite(curvature)) or not np.all(np.isfinite(slopes)):
             return None
         size = np.sqrt(np.bincount(self._row, slopes**2, minlength=len(b)))
@@ -395,22 +393,16 @@ class Bordered:
             return None
         n, k = self.inner, self._size - self.inner
         band = values[: (self.width + 1) * n].reshape(n, self.width + 1).T
-        below = values[(self.width + 1) * n :].reshape(k, self._size)
+        border = values[(self.width + 1) * n :].reshape(k, self._size)
+        below, corner = border[:, :n], border[:, n:]
         try:
             lower = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if n else band
-            solved = (
-                scipy.linalg.cho_solve_banded((lower, True), below[:, :n].T, check_finite=False)
-                if n and k
-                else below[:, :n].T
-            )
-            corner = (
-                scipy.linalg.cholesky(below[:, n:] - below[:, :n] @ solved, lower=True, check_finite=False)
-                if k
-                else below
-            )
+            solved = scipy.linalg.cho_solve_banded((lower, True), below.T, check_finite=False) if n and k else below.T
+            if k:
+                corner = scipy.linalg.cholesky(corner - below @ solved, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
             return None
-        return Cholesky(self.place, lower, below[:, :n], solved, corner)
+        return Cholesky(self.place, lower, below, solved, corner)
 
 
 @dataclass(frozen=True)
@@ -437,10 +429,7 @@ class Cholesky:
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):
             return np.asarray(inner)
-        half = scipy.linalg.solve_triangular(
-            self.corner, right[n:] - self.below @ inner, lower=True, check_finite=False
-        )
-        last = scipy.linalg.solve_triangular(self.corner, half, trans=1, lower=True, check_finite=False)
+        last = scipy.linalg.cho_solve((self.corner, True), right[n:] - self.below @ inner, check_finite=False)
         return np.concatenate([inner - self.solved @ last, last])
 
 

@@ -383,10 +383,8 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
     hess = _scatter_matrix([at for at, _ in upper], parts, no_constants, (n, n), [factors for _, factors in upper])
 
     slope = ca.MX.zeros(parameters)
-    if parameters:
-        slope += sum(
-            ca.sum2(evaluate_block(function.slope, b, [*call, gather(lam, b.rows)])[0]) for b, function, call in calls
-        )
+    for block, function, call in calls if parameters else ():
+        slope += ca.sum2(evaluate_block(function.slope, block, [*call, gather(lam, block.rows)])[0])
     return Program(
         nlp={"x": x, "p": p, "f": f, "g": g},
         gradient=ca.Function("nlp_grad_f", [x, p], [f, gradient], ["x", "p"], ["f", "grad_f_x"]),

@@ -155,10 +155,9 @@ def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.nda
     if not np.linalg.norm(matrix.T @ y) < SOLVER_SHARE:
         return []
     declared = np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
-    chosen = equal[np.isin(transcription.row_bounds[equal], declared) & (np.abs(y) > IMPLIED_SHARE * np.abs(y).max())]
-    size = dict(zip(equal.tolist(), np.abs(y).tolist(), strict=True))
-    order = sorted(chosen.tolist(), key=lambda i: -size[i])
-    return list(dict.fromkeys(transcription.row_labels[i] for i in order))[: SETTINGS.lines]
+    size = np.where(np.isin(transcription.row_bounds[equal], declared), np.abs(y), 0.0)
+    order = [i for i in np.argsort(-size, kind="stable") if size[i] > IMPLIED_SHARE * np.abs(y).max()]
+    return list(dict.fromkeys(transcription.row_labels[equal[i]] for i in order))[: SETTINGS.lines]
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:

@@ -100,16 +100,12 @@ class Collocation(DirectMethod):
         # with a piecewise constant control an equality is imposed once per interval
         rows = path.select(~equality | (not piecewise_constant))
         index = build.rows(rows.labels, rows.bounds, stage_of, at)
-        at_point = build.point(
-            states[:, 1:].reshape(n * d, nx).T,
-            (np.repeat(controls[:, 0], d, axis=0) if piecewise_constant else controls.reshape(n * d, nu)).T,
-            stage_of,
-        )
+        at_controls = np.repeat(controls[:, 0], d, axis=0) if piecewise_constant else controls.reshape(n * d, nu)
+        at_point = build.point(states[:, 1:].reshape(n * d, nx).T, at_controls.T, stage_of)
         numbers = np.vstack([form.point_data(at), np.repeat(width, d), np.outer(width, weights).ravel()])
         data = form.sym("d", len(numbers))  # fraction and signals, width, weight
-        function = form.point_function(
-            "point", data, data[-1] * form.T * form.running, ca.vertcat(-data[-2] * form.T * form.f, rows.expression)
-        )
+        residuals = ca.vertcat(-data[-2] * form.T * form.f, rows.expression)
+        function = form.point_function("point", data, data[-1] * form.T * form.running, residuals)
         build.blocks.append(Block(function, at_point, numbers, np.vstack([dynamics, index])))
 
         # the other places of the path constraints
@@ -339,10 +335,9 @@ def dense_function(form: Formulation, method: MultipleShooting) -> Any:
         place = i / method.steps
         time = (d[0] + d[1] * place) * horizon
         slopes.append(h * rate(state, control_at(form, method, w, place), time, horizon, p))
-    curves = []
-    for a, b, da, db in zip(knots[:-1], knots[1:], slopes[:-1], slopes[1:], strict=True):
-        for s in THIRDS:
-            curves.append(
-                (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * da + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * db
-            )
+    curves = [
+        (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * da + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * db
+        for a, b, da, db in zip(knots[:-1], knots[1:], slopes[:-1], slopes[1:], strict=True)
+        for s in THIRDS
+    ]
     return ca.Function("dense", [v, d, horizon, p], [ca.horzcat(*curves)])

@@ -179,9 +179,8 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
             continue
         actual, size = values[name].shape[1], entries.stop - entries.start
         if actual != size:
-            raise ProblemError(
-                f"guess of {name!r} has {actual} entries, {size} expected", name=name, value=actual, limit=size
-            )
+            words = f"guess of {name!r} has {actual} entries, {size} expected"
+            raise ProblemError(words, name=name, value=actual, limit=size)
         shift = NODE_TOLERANCE if name in guess.controls else 0.0
         shared[name] = lambda s, name=name, shift=shift: guess.at_fraction(np.maximum(s - shift, 0.0))[name]  # type: ignore[misc]
     if not shared:

@@ -289,7 +289,8 @@ class Prepared:
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
-            never_finite = len(attempts) > 1 and all(attempt.is_broken for attempt in (first, *attempts))
+            statuses = {attempt.outcome.status for attempt in (first, *attempts)}
+            never_finite = len(attempts) > 1 and statuses == {SolverStatus.NOT_FINITE}
             if attempts[-1].is_final or never_finite:
                 break
             remaining -= attempts[-1].outcome.iterations
@@ -439,11 +440,6 @@ class Attempt:
     def is_final(self) -> bool:
         """Whether no other start will be tried: the solver has succeeded, or the time limit is reached."""
         return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
-
-    @property
-    def is_broken(self) -> bool:
-        """Whether the run ended because a function value was not finite or an integrator failed."""
-        return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:
         return f"from the {self.start}: {self.outcome.status} after {self.outcome.iterations} iterations"

@@ -340,9 +340,8 @@ class PredeterminedVariables:
         self.variables = np.zeros(transcription.size, dtype=bool)
         self.variables[state] = independent[transcription.variable_entry[state]]
         self.later = self.variables & (transcription.variable_fraction > 0)
-        self.declared = np.isin(
-            transcription.row_bounds, np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
-        )
+        declared = np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
+        self.declared = np.isin(transcription.row_bounds, declared)
         self.rows, self.columns = program.jacobian_entries
         # linear rows of two variables, such as those that join the end of an interval to the next node
         linear, column, _ = transcription.linear

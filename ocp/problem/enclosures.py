@@ -217,10 +217,8 @@ class PrescribedMotion:
         covered = CoveredPairs(separation.pairs, separation.covers)
         for first, second, seen in covered.rows:
             if seen != WORLD and {seen, hulls[first].frame, hulls[second].frame} & set(frames):
-                words = (
-                    f"{what}: bodies on frames that depend on time must be observed from the world, -1, not from {seen}"
-                )
-                raise ProblemError(words, name="pairs", value=int(seen), limit=WORLD)
+                words = f"{what}: bodies on frames that depend on time must be observed from the world, -1, not from "
+                raise ProblemError(f"{words}{seen}", name="pairs", value=int(seen), limit=WORLD)
         self._bodies: list[tuple[int, np.ndarray]] = []
         self._of_pair = np.full((len(separation), 2), -1)
         for pair, side in np.ndindex(*self._of_pair.shape):

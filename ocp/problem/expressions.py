@@ -57,10 +57,8 @@ class ExpressionReader:
         identities = {identity(s) for symbol in known for s in ca.symvar(symbol)}
         for symbol in ca.symvar(expression):
             if identity(symbol) not in identities:
-                raise ProblemError(
-                    f"{what} uses the symbol {symbol.name()!r}, which is not allowed here: it is not part of this "
-                    f"problem, was declared later, or has no meaning at this place"
-                )
+                words = f"{what} uses the symbol {symbol.name()!r}, which is not allowed here: it is not part of this "
+                raise ProblemError(words + "problem, was declared later, or has no meaning at this place")
         return expression
 
     def column(self, what: str, value: Value, size: int, default: float) -> Any:

@@ -100,11 +100,8 @@ class BoundTable:
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)
-        return ca.Function(
-            "pullback",
-            [parameters, multipliers],
-            [sum(ca.jtimes(bounds[i], parameters, multipliers[:, i], True) for i in (0, 1))],
-        )
+        total = sum(ca.jtimes(bounds[i], parameters, multipliers[:, i], True) for i in (0, 1))
+        return ca.Function("pullback", [parameters, multipliers], [total])
 
 
 class Formulation:
@@ -319,9 +316,8 @@ class Formulation:
                     raise ProblemError(f"{what} has no value; give parameters={{{name!r}: ...}}")
                 value = numeric(what, entries[name])
                 if value.size not in (1, size):
-                    raise ProblemError(
-                        f"{what} has {value.size} entries, {size} expected", value=value.size, limit=size
-                    )
+                    words = f"{what} has {value.size} entries, {size} expected"
+                    raise ProblemError(words, value=value.size, limit=size)
                 check_finite(what, value)
             vector[place] = value
         return vector
@@ -405,6 +401,7 @@ class Formulation:
         lower = ca.vertcat(symbols(0, 1), *[c.lower for c in pool.values()])
         upper = ca.vertcat(symbols(0, 1), *[c.upper for c in pool.values()])
         equality = np.array([bool(ca.is_equal(lower[i], upper[i], 8)) for i in range(len(names))], dtype=bool)
+        tolerances = [np.full(c.size, np.inf) if c.tolerance is None else c.tolerance for c in pool.values()]
         return Rows(
             expression,
             names,
@@ -413,10 +410,7 @@ class Formulation:
             equality,
             np.asarray(dependence(expression, self.u).any(axis=1)),
             dependence(expression, self.x),
-            np.array(
-                [t for c in pool.values() for t in ([np.inf] * c.size if c.tolerance is None else c.tolerance)],
-                dtype=float,
-            ),
+            np.concatenate([np.zeros(0), *tolerances]),
         )
 
     def _bound_table(self) -> BoundTable:

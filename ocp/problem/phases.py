@@ -353,10 +353,8 @@ class _PhaseInserter:
 
     def _separation(self, separation: Separation, length: float | None) -> Separation:
         if length is None and ca.depends_on(separation.placements, self.problem.time):
-            words = (
-                f"phase {self.name!r}: {separation.name!r} has moving obstacles and needs a horizon that is a number"
-            )
-            raise ProblemError(words, name=separation.name)
+            words = f"{separation.name!r} has moving obstacles and needs a horizon that is a number"
+            raise ProblemError(f"phase {self.name!r}: {words}", name=separation.name)
         return replace(
             separation,
             name=self._prefix(separation.name),

@@ -152,13 +152,16 @@ def test_the_worst_collision_of_each_sample_is_the_one_found_alone(name: str) ->
     assert worst_collisions(around, base[:0], joints[:0], TIMES[:0]) == []
 
 
-def test_one_base_for_all_samples_is_that_base_at_each() -> None:
-    around = CollisionScene(FreeFloating(armoured_arm(4)), OBSTACLES)
+def test_one_base_or_time_for_all_samples_is_that_base_or_time_at_each() -> None:
+    around = CollisionScene(FreeFloating(armoured_arm(4)), (*OBSTACLES, MOVING))
     base, joints = configurations(around.machine, len(TIMES), 6)
     same = np.tile(base[0], (len(TIMES), 1))
     each = distances_along(around, same, joints, TIMES)
     assert_allclose(distances_along(around, base[0], joints, TIMES), each)
     assert np.ptp(each, axis=0).max() > 0.1
+    shared = distances_along(around, base, joints, TIMES[2])
+    assert_allclose(shared, distances_along(around, base, joints, np.full(len(TIMES), TIMES[2])))
+    assert np.abs(shared - distances_along(around, base, joints, TIMES)).max() > 0.01
 
 
 def test_without_pairs_there_are_no_distances_and_nan_counts_as_collision() -> None:
