@@ -69,7 +69,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Set ``stop`` to end the public call in this thread; if the call continues, raise KeyboardInterrupt there."""
+        """Ask the call that this thread runs to end (``stop``); raise KeyboardInterrupt in it if it does not."""
         self.stop = True
         began = time.monotonic()
         try:

@@ -70,7 +70,7 @@ class Method(Protocol[P_co]):
         compiled: bool = False,
         scaling: bool = True,
     ) -> P_co:
-        """Prepare a problem once for repeated solves; see :func:`ocp.methods.prepare`."""
+        """Prepare a problem for repeated solves by this method; the function :func:`ocp.methods.prepare` calls it."""
         ...
 
 

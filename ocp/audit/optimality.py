@@ -135,7 +135,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add the multipliers of limits that the mask ``chosen`` (M, m) selects to a quadratic program; return them.
+        """Return the multipliers of limits in the mask ``chosen`` (M, m), added as variables to a quadratic program.
 
         ``slopes`` (M, m, n) are the derivatives of the limits with respect to variables of the given ``size`` (n,).
         A multiplier per unit of the horizon fraction s costs its gap times the ``share`` (M,) of its point.

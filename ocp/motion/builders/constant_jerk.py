@@ -95,7 +95,7 @@ def least_durations(distances: Array, bounds: JointBounds) -> Array:
 
 
 def least_squared_velocities(distances: Array, duration: float, acceleration: Array) -> Array:
-    """Return each joint's least integral of squared velocity from rest to rest over given distances. Shape (..., n).
+    """Return each joint's least integral of squared velocity from rest to rest in a given time. Shape (..., n).
 
     Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity v = 2 d /
     (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a). It is infinite where the

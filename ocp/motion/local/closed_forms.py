@@ -167,7 +167,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function from a tip pose to candidate angles of two joints, with residuals and condition of the equations."""
+        """Function of a tip pose: candidates for two angles, residuals, and a number that is 0 if an angle is free."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size

@@ -262,7 +262,7 @@ class MotionSample:
 
     @classmethod
     def of_local(cls, stretch: Stretch, motion: LocalMotion) -> MotionSample:
-        """Convert the first of several local (resolved-rate) motions to samples in one time interval."""
+        """Return the samples, within one time interval, of the first of several local (resolved-rate) motions."""
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     @property

@@ -184,7 +184,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions of squared-speed splines: at rest, the ratio of the outer two coefficients is fixed; else both."""
+    """Ends of squared-speed splines: the outer two coefficients have a fixed ratio at rest, fixed values in motion."""
 
     def __init__(self, program: Program) -> None:
         n, width, (first, last) = len(program.upper), program.spline.width, program.rest

@@ -46,7 +46,7 @@ class QuadraticBounds(NamedTuple):
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Return the minimum of each lower bound over the box (N, r) of its chart, and the minimiser (N, r)."""
+        """Return each chart's minimum of the value-function bound over a box (N, r), and the minimiser (N, r)."""
         least, place = least_in_box(self.slope, self.curve, low, high)
         return self.least + least, place
 
