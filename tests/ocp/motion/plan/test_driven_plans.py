@@ -216,8 +216,7 @@ def scaled_line(size: float) -> tuple[Machine, TipTask]:
     machine = FixedBase(planar_chain([size * length for length in LENGTHS], [size**3 * mass for mass in MASSES]))
     first = np.array(machine.tip_pose(machine.base_home(), START).position).ravel().astype(float)
     path = smooth(CornerPath.through([first, first + size * np.array([-0.4, 0.25, 0.0])]), 0.002 * size)
-    ramps = {"acceleration": size, "jerk": 10.0 * size}
-    return machine, TipTask.along(path, 0.3 * size, rows=(3, 4), **ramps)
+    return machine, TipTask.along(path, 0.3 * size, rows=(3, 4), acceleration=size, jerk=10.0 * size)
 
 
 @pytest.mark.long
