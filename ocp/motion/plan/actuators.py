@@ -35,6 +35,7 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import LIMITED, JointBounds, Limits
 from ocp.motion.tasks.speed_profile import ramp_time
 from ocp.problem.problem import Problem
+from ocp.refinement import split
 from ocp.solution import Solution
 from ocp.tolerances import LIMIT_SHARE, RESOLVED_SHARE, ROUNDING_SHARE, STANDSTILL
 
@@ -195,8 +196,10 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     mesh = points.with_nodes_at(np.unique(np.concatenate([ramps, *fractions])).tolist())
     cost = unlimited.cost if request.cost is None else cost_of_motion(unlimited, request.cost)
     is_at_rest = cost <= request.settings.negligible_rate * request.stretches[-1].end
-    settings = SolveSettings(mesh, guess_cost=np.inf if is_at_rest else cost)
     smoothing = Actuation.smoothing if is_at_rest else _smoothing(unlimited, mesh, cost, has_jerks)
+    if has_jerks:
+        mesh = _mesh_at_limits(request, unlimited, limits, mesh, smoothing)
+    settings = SolveSettings(mesh, guess_cost=np.inf if is_at_rest else cost)
 
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
@@ -226,18 +229,42 @@ def _smoothing(unlimited: SolvedPlan, mesh: Collocation, cost: float, has_jerks:
     """Return the duration, as a share of the horizon, in which a control passes from limit to limit.
 
     It is the default unless the term of the cost that depends on this duration (see `declare_actuators`) is then larger
-    than the permitted error of `cost`, the cost of the motion without actuator limits.
+    than the permitted error of `cost`, the cost of the motion without actuator limits, or smaller than a plan resolves.
     """
     fractions, squares = _guess_fractions(mesh), 0.0
     for part in unlimited.parts:
         times, controls = fractions * (part.end - part.begin), unlimited.accelerations(part, fractions.ravel())
         controls = _slopes(controls, times) if has_jerks else controls
         squares += float(np.trapezoid((controls**2).sum(axis=1), times.ravel()))
-    order, default = 4 if has_jerks else 2, Actuation.smoothing
-    largest = 2.0 * LIMIT_SHARE * cost
-    if squares * (default * unlimited.horizon) ** order <= largest:
-        return default
-    return float((largest / squares) ** (1 / order) / unlimited.horizon)
+    if not squares > 0:
+        return Actuation.smoothing
+    terms = 2.0 * cost * np.array([RESOLVED_SHARE, LIMIT_SHARE])
+    return float(np.clip(Actuation.smoothing, *(terms / squares) ** (0.25 if has_jerks else 0.5) / unlimited.horizon))
+
+
+def _mesh_at_limits(
+    request: PlanRequest, unlimited: SolvedPlan, limits: Limits, mesh: Collocation, smoothing: float
+) -> Collocation:
+    """Return a mesh that resolves the jerks where a motion without actuator limits exceeds them, and just outside.
+
+    With v'' = u, the cost v^2 + d^4 u^2 of a duration d of smoothing makes v, after a limit, a decaying oscillation
+    with the wavelength 2 pi sqrt(2) d. An interval resolves half of it. A neighbour is at most twice as wide.
+    """
+    bounds, fractions, exceeds = limits.bounds(request.machine), _guess_fractions(mesh), np.zeros(mesh.intervals, bool)
+    for part in unlimited.parts:
+        accelerations = unlimited.accelerations(part, fractions.ravel())
+        jerks = _slopes(accelerations, fractions * (part.end - part.begin))
+        beyond = (np.abs(accelerations) > bounds.acceleration) | (np.abs(jerks) > bounds.jerk)
+        exceeds |= beyond.reshape(mesh.intervals, -1).any(axis=1)
+    widths = np.diff(mesh.fractions)
+    parts = np.where(exceeds, np.ceil(widths / (np.pi * np.sqrt(2.0) * smoothing)), 1).astype(int)
+    nodes = split(mesh.fractions, parts, widths, request.settings.max_intervals)
+    while exceeds.any():
+        widths = np.diff(nodes)
+        narrower = np.minimum(np.append(widths[1:], 1.0), np.append(1.0, widths[:-1]))
+        exceeds = widths > (2.0 + ROUNDING_SHARE) * narrower
+        nodes = np.union1d(nodes, (nodes[:-1] + widths / 2)[exceeds])
+    return mesh.with_mesh(nodes)
 
 
 def _guess_fractions(mesh: Collocation) -> Array:

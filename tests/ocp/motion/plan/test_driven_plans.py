@@ -17,6 +17,7 @@ from models import (
     Machine,
     example_robot,
     inverse_dynamics,
+    mount_on_rail,
     planar_chain,
     smooth,
     with_load,
@@ -189,6 +190,50 @@ def test_joints_at_rest_have_no_acceleration_if_their_jerk_is_limited(most: floa
     assert np.abs(result.solution["jerks"]).max() <= most * (1 + 1e-6)
     assert free.cost <= result.cost < 1.1 * free.cost
     assert len(result.solution.control_interpolant.breaks) <= 1.5 * POINTS.intervals
+
+
+def assert_within_shares_of_peaks(machine: Machine, task: TipTask, share: float, start: Any = None) -> Plan:
+    """Plan within a share of the peaks of the motion without limits; check the limits by samples, and the cost."""
+    options: dict[str, Any] = {"search": "start", "scene": False, "start": start}
+    sample = plan(machine, task, **options).sample(5e-4)
+    jerks = np.abs(np.gradient(sample.accelerations, sample.t, axis=0))
+    joint = int(np.abs(sample.accelerations).max(axis=0).argmax())
+    largest = share * np.abs(sample.accelerations[:, joint]).max(), share * jerks[:, joint].max()
+    others = np.arange(machine.joint_size) != joint
+    acceleration, jerk = (np.where(others, 10.0 * each, each) for each in largest)
+    result = plan(machine, task, limits=Limits(acceleration=acceleration, jerk=jerk), **options)
+    assert result.audit().feasible
+    limited = result.sample(5e-4)
+    assert (np.abs(limited.accelerations).max(axis=0) <= acceleration + 1e-5).all()
+    assert (np.abs(np.diff(limited.accelerations, axis=0)) / 5e-4 <= jerk * (1 + LIMIT_SHARE)).all()
+    assert np.abs(limited.accelerations[:, joint]).max() == pytest.approx(largest[0], rel=0.01)
+    assert np.abs(limited.rates[[0, -1]]).max() <= LIMIT_SHARE * np.abs(limited.rates).max()
+    return result
+
+
+def scaled_line(size: float) -> tuple[Machine, TipTask]:
+    """Return an arm of three links and a line from its start configuration; all lengths have the same factor."""
+    machine = FixedBase(planar_chain([size * length for length in LENGTHS], [size**3 * mass for mass in MASSES]))
+    first = np.array(machine.tip_pose(machine.base_home(), START).position).ravel().astype(float)
+    path = smooth(CornerPath.through([first, first + size * np.array([-0.4, 0.25, 0.0])]), 0.002 * size)
+    return machine, TipTask.along(path, 0.3 * size, rows=(3, 4), acceleration=size, jerk=10.0 * size)
+
+
+@pytest.mark.long
+def test_joints_within_shares_of_their_free_peaks_move_alike_on_machines_of_all_sizes() -> None:
+    """A machine and a tool path that are fifty times smaller leave angles and times as they are."""
+    large, small = (assert_within_shares_of_peaks(*scaled_line(size), 0.95, START) for size in (1.0, 0.02))
+    assert small.cost == pytest.approx(large.cost, rel=LIMIT_SHARE)
+    times = np.linspace(0.0, large.horizon, 50)
+    np.testing.assert_allclose(small.at(times)["joints"], large.at(times)["joints"], atol=LIMIT_SHARE)
+
+
+@pytest.mark.long
+def test_a_rail_within_shares_of_its_free_peaks_leaves_the_rest_of_a_ramp_to_the_arm() -> None:
+    robot = mount_on_rail(planar_chain([0.5, 0.4], [1.0, 1.0]), (1, 0, 0), -3.0, 3.0, velocity=2.0)
+    path = smooth(CornerPath.through([(-1.0, 0.6, 0.0), (1.0, 0.5, 0.0)]), 0.002)
+    result = assert_within_shares_of_peaks(FixedBase(robot), TipTask.along(path, 0.3, rows=(3, 4)), 0.7)
+    assert result.audit().passed
 
 
 def test_joints_that_end_without_a_task_rest_at_fixed_values() -> None:
