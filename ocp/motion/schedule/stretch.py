@@ -36,7 +36,7 @@ from ocp.motion.schedule.window import (
     parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
-from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, join_profiles, profile_between
+from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, integrate_jerk, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
 ACTIVE_SHARE = 0.98
@@ -254,8 +254,7 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(profile: SpeedProfile, places: Array, speed: Array, rows: Array) -> tuple[Array, Array]:
     """Return the largest ratio to its limit of a quantity except jerk: at five points and over each interval.
 
-    The points are the start, the first Gauss point, the middle, the second Gauss point and the end. In either half each
-    row is interpolated by a parabola through three of them; what a cubic may deviate from it is added. Shapes (5, N)
+    The points are the start, first Gauss point, middle, second Gauss point and end. In either half each row is interpolated by a parabola through three of them; what a cubic may deviate from it is added. Shapes (5, N)
     and (N,).
 
     Args:
@@ -264,9 +263,15 @@ def _usage_without_jerk(profile: SpeedProfile, places: Array, speed: Array, rows
         speed: Largest coefficients of the speed at the five points. Shape (5, N), s/m.
         rows: Coefficients (p, q, r) of the limits of the acceleration there. Shape (3, R, 5, N).
     """
-    inside, end = profile.at_distance(places.ravel()), profile.acceleration[:-1] + profile.jerk * np.diff(profile.t)
-    v = np.vstack([profile.speed[:-1], inside.speed.reshape(3, -1), profile.speed[1:]])
-    a = np.vstack([profile.acceleration[:-1], inside.acceleration.reshape(3, -1), end])
+    first, last, acceleration, jerk = profile.speed[:-1], profile.speed[1:], profile.acceleration[:-1], profile.jerk
+    covered = places - profile.distance[:-1]
+    share = covered / np.diff(profile.distance)
+    # time at constant acceleration, then Newton steps, which converge quadratically
+    t = 2 * covered / (first + np.sqrt((1 - share) * first**2 + share * last**2))
+    for _ in range(2):
+        reached, v, a = integrate_jerk(first, acceleration, jerk, t)
+        t -= (reached - covered) / v
+    _, v, a = integrate_jerk(first, acceleration, jerk, np.vstack([0 * first, t, np.diff(profile.t)]))
     p, q, r = rows
     values = np.concatenate([(speed * v)[None], p * a + q * v**2 + r])
     sizes = np.abs(values)
@@ -368,7 +373,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
     From rest, squared speed to the power 3/4 grows by the square root of 9/2 of the jerk times the distance; a known
     motion may slow down likewise.
     """
-    steady = np.minimum(left.steady()[0], right.steady()[0])
+    steady = np.minimum(left.steady(), right.steady())
     y = (SETTINGS.start * np.minimum(most, node_minimum(steady) ** 2)) ** 0.75
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
