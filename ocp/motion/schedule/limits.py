@@ -170,7 +170,7 @@ class LineLimits:
 
     def torques(self, count: int) -> Array:
         """Return the torque limits of `count` joints. Shape (count,)."""
-        return self._of_joints(count, ("torque",))[0]
+        return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
         """Return the joint limits named by `names`, such as "jerk", for `count` joints. Shape (len(names), count)."""

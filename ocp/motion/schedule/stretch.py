@@ -36,7 +36,7 @@ from ocp.motion.schedule.window import (
     parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
-from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, integrate_jerk, join_profiles, profile_between
+from ocp.motion.tasks.speed_profile import SpeedProfile, integrate_jerk, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
 ACTIVE_SHARE = 0.98
@@ -254,8 +254,8 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
 def _usage_without_jerk(profile: SpeedProfile, places: Array, speed: Array, rows: Array) -> tuple[Array, Array]:
     """Return the largest ratio to its limit of a quantity except jerk: at five points and over each interval.
 
-    The points are the start, first Gauss point, middle, second Gauss point and end. In either half each row is interpolated by a parabola through three of them; what a cubic may deviate from it is added. Shapes (5, N)
-    and (N,).
+    The points are the start, first Gauss point, middle, second Gauss point and end. In either half each row is
+    interpolated by a parabola through three of them; what a cubic may deviate from it is added. Shapes (5, N) and (N,).
 
     Args:
         profile: Motion, with one segment in each interval.
