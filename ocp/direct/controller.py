@@ -180,15 +180,19 @@ class Controller:
         self._shift = np.ones(1)
         control, x, _, lam_g, cost, rows = self._last[: -len(MEASURES)]
         iterations, value = int(self._solver.stats(1)["iter_count"]), float(cost[0])
+        dynamics, limits, residual = measures
         converged, seconds = max(measures) <= tolerance and not held, time.perf_counter() - began
         status = SolverStatus.SOLVED if converged else SolverStatus.ITERATION_LIMIT
 
         def prediction() -> Solution:
             outcome = Outcome(x, value, rows, lam_g, status, "", iterations, seconds, solver="sqpmethod")
-            return self._prepared.solution_from(outcome, p, "last step")
+            solution: Solution = self._prepared.solution_from(outcome, p, "last step")
+            return solution
 
         controls = {name: control[place] for name, place in form.controls.items()}
-        return ControlStep(controls, value, converged, *measures, iterations, seconds, held, prediction)
+        return ControlStep(
+            controls, value, converged, dynamics, limits, residual, iterations, seconds, held, prediction
+        )
 
     def to_c(self, folder: str | os.PathLike[str]) -> Path:
         """Write the controller with its solver as C: code, an example main program, and a Makefile that builds both.
