@@ -57,8 +57,8 @@ class StretchSettings:
             which they are halved.
         lost: Predicted share of the time that a motion loses because its jerk is constant in each interval: the
             promised accuracy.
-        exceeded: Share by which a motion without jerk limits may exceed limits between nodes: within the promised
-            accuracy of 1e-3, and so small that the time, which falls with its root, is exact to 1e-4 in the mean.
+        exceeded: Share by which a motion without jerk limits may exceed limits between nodes: a third of the promised
+            accuracy of 1e-3. Where it does, the motion is faster by half of that share.
         parts: Largest number of parts into which an interval is split at once.
         accuracies: Relative accuracy of the travel time of a window in each round, no finer than the enforced limits
             still change; the last value serves all later rounds.
