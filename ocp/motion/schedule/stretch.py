@@ -57,8 +57,8 @@ class StretchSettings:
             which they are halved.
         lost: Predicted share of the time that a motion loses because its jerk is constant in each interval: the
             promised accuracy.
-        exceeded: Share by which a motion without jerk limits may exceed limits between nodes: a third of the promised
-            accuracy of 1e-3. Where it does, the motion is faster by half of that share.
+        exceeded: Share by which a motion without jerk limits may exceed limits between nodes: half of the promised
+            accuracy of 1e-3.
         parts: Largest number of parts into which an interval is split at once.
         accuracies: Relative accuracy of the travel time of a window in each round, no finer than the enforced limits
             still change; the last value serves all later rounds.
@@ -76,7 +76,7 @@ class StretchSettings:
     rounds: int = 20
     unused: float = 1e-4
     lost: float = 1e-3
-    exceeded: float = 3e-4
+    exceeded: float = 5e-4
     parts: int = 8
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
     around: int = 40
@@ -237,7 +237,8 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
         parts = np.clip(np.ceil(2 * (peak - 1) / SETTINGS.exceeded) - 1, 1, SETTINGS.parts).astype(np.intp)
         unused = np.where(used[[0, -1]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[2], 0.0)
         if unused @ np.diff(profile.t) > SETTINGS.unused * profile.duration:
-            parts[unused > 2 * SETTINGS.exceeded] = SETTINGS.parts  # halves would exceed limits and be split again
+            # in halves, which gain speed, limits would be violated again
+            parts = np.maximum(parts, np.where(unused > 2 * SETTINGS.exceeded, SETTINGS.parts // 2, 1))
         if not (parts > 1).any():
             return profile
         at = np.repeat(np.arange(len(parts)), parts)
