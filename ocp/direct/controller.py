@@ -13,6 +13,7 @@ constraints lose theirs. It is positive semidefinite if the rest of the cost is 
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -149,7 +150,7 @@ class Controller:
         of_bounds = np.where(at_limit(v, limits["lbx"], limits["ubx"], of_bounds), of_bounds, 0.0)
         of_rows = np.where(at_limit(rows, limits["lbg"], limits["ubg"], of_rows), of_rows, 0.0)
         self._state = v, of_bounds, of_rows
-        self._is_first, self._last = True, dict[str, np.ndarray]()
+        self._shift, self._last = np.zeros(1), list[np.ndarray]()  # no shift in the first step
 
     def step(self, parameters: ByName = None) -> ControlStep:
         """Solve the problem for new parameters, such as the measured state, starting from the shifted last result.
@@ -166,47 +167,31 @@ class Controller:
         lower, upper = self._bounds(p)
         if not (lower <= upper).all():
             form.bound_values(p)  # raises an error that names the bound
-        shift = np.array([0.0 if self._is_first else 1.0])
-        measures = np.full(len(MEASURES), np.inf)
-        try:
-            values = dict(zip(OUTPUTS, self._run(p, *self._state, shift), strict=True))
-            measures = np.concatenate([values[name] for name in MEASURES])
-        except RuntimeError:  # a function of the problem is not finite, or cannot be evaluated
-            values = self._last
-        held = not np.isfinite(measures).all()
+        measures, held = [np.inf] * len(MEASURES), True
+        with suppress(RuntimeError):  # a function of the problem is not finite, or cannot be evaluated
+            outputs = self._run(p, *self._state, self._shift)
+            measures = [float(value[0]) for value in outputs[-len(MEASURES) :]]
+            held = not math.isfinite(sum(measures))
         if held and not self._last:
             words = f"controller: a function of problem {form.name!r} is not finite at these parameters, and no earlier"
             raise SolveError(f"{words} step can be held; start again from a plan: reset(plan)", name=form.name)
-        if held:
-            values = self._last
-        else:
-            self._state, self._last = (values["x"], values["lam_x"], values["lam_g"]), values
-        self._is_first = False
-        iterations = int(self._solver.stats(1)["iter_count"])
-        converged = bool((measures <= tolerance).all())
-        outcome = Outcome(
-            values["x"],
-            float(values["cost"][0]),
-            values["rows"],
-            values["lam_g"],
-            SolverStatus.SOLVED if converged else SolverStatus.ITERATION_LIMIT,
-            "",
-            iterations,
-            time.perf_counter() - began,
-            solver="sqpmethod",
-        )
-        dynamics, limits, residual = measures.tolist()
+        if not held:
+            self._last, self._state = outputs, tuple(outputs[1:4])
+        self._shift = np.ones(1)
+        control, x, _, lam_g, cost, rows = self._last[: -len(MEASURES)]
+        iterations, value = int(self._solver.stats(1)["iter_count"]), float(cost[0])
+        dynamics, limits, residual = measures
+        converged, seconds = max(measures) <= tolerance and not held, time.perf_counter() - began
+        status = SolverStatus.SOLVED if converged else SolverStatus.ITERATION_LIMIT
+
+        def prediction() -> Solution:
+            outcome = Outcome(x, value, rows, lam_g, status, "", iterations, seconds, solver="sqpmethod")
+            solution: Solution = self._prepared.solution_from(outcome, p, "last step")
+            return solution
+
+        controls = {name: control[place] for name, place in form.controls.items()}
         return ControlStep(
-            {name: values["control"][place] for name, place in form.controls.items()},
-            outcome.cost,
-            converged,
-            dynamics,
-            limits,
-            residual,
-            iterations,
-            outcome.seconds,
-            held,
-            lambda: self._prepared.solution_from(outcome, p, "last step"),
+            controls, value, converged, dynamics, limits, residual, iterations, seconds, held, prediction
         )
 
     def to_c(self, folder: str | os.PathLike[str]) -> Path:

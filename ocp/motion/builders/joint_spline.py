@@ -58,7 +58,9 @@ class SplineSettings:
     # least number of samples of a plan in each segment of the path: the third derivative of a blend is then within
     # some percent, and the duration of a motion, which depends on its cube root, within 1e-3
     segment_samples: int = 24
-    batch: int = 1024  # number of path points whose torques are computed together
+    # number of path points whose torques are computed together, and of which the width of a work array is a multiple
+    batch: int = 1024
+    width: int = 256
 
 
 SPLINE = SplineSettings()
@@ -118,8 +120,8 @@ class PlannedJoints:
         if self.forces is None:
             message = f"torques along a path need a FixedBase, not a {type(self.machine).__name__}"
             raise ProblemError(message, name="machine", value=self.machine)
-        along = self.at(distance)
-        return _Torques(*self.forces(along.position, along.first, along.second))
+        places = self._check_distance(distance)
+        return _Torques(*self.forces(*(self.curves(places, order) for order in range(3))))
 
     def _check_distance(self, distance: Any) -> Array:
         """Clip distances to the path; raise ProblemError if a distance is off the path by more than rounding errors."""
@@ -359,7 +361,7 @@ class _BatchedFunction:
     def _evaluate_batch(self, inputs: list[Array], results: list[Array]) -> None:
         """Evaluate the function for at most `SPLINE.batch` inputs at once."""
         count = len(inputs[0])
-        width = min(SPLINE.batch, 1 << (count - 1).bit_length())  # operations on the work array take its whole width
+        width = -(-count // SPLINE.width) * SPLINE.width  # operations on the work array take its whole width
         try:
             table, steps = self.tables.setdefault(width, []).pop()
         except IndexError:  # first call, or in use by another thread

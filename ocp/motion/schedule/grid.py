@@ -207,12 +207,12 @@ def _halve_intervals(
     _check_rest(rows, places, limit_names(limits, joints))
     left, right = np.arange(len(s) - 1), np.arange(1, len(s))
     right[np.searchsorted(s, jumps[0][at]) - 1] = len(s) + np.arange(len(at))
-    new, shares = left, (0.5, *GAUSS)
+    new, shares, steady = left, np.array([[0.5], [GAUSS[0]], [GAUSS[1]]]), rows.steady()
     at_rest = s[0] == 0, s[-1] == path.length
     for number in range(SETTINGS.halvings + 1):
         begin, end, width = rows.take(left), rows.take(right), np.diff(s)
         most = requested[1][segment_index(requested[0], (s[:-1] + s[1:]) / 2)]
-        top = np.minimum(np.minimum(begin.steady()[0], end.steady()[0]), most)  # fastest steady speed
+        top = np.minimum(np.minimum(steady[left], steady[right]), most)  # fastest steady speed
         rates = acceleration_bounds(begin, end, top**2, top**2)
         if number == SETTINGS.halvings or not new.size:
             break
@@ -220,16 +220,15 @@ def _halve_intervals(
         squares = reachable_squares(s, node_minimum(top) ** 2, rates, at_rest)
         inside = np.sqrt(np.minimum(top**2, (squares[:-1] + squares[1:]) / 2 + rates * width))
         # a wave may have equal phases at both ends and in the middle: other places tell
-        places = np.concatenate([s[new] + share * width[new] for share in shares])
-        between, uneven = limit_rows(path, limits, joints, places), np.zeros(len(new), dtype=bool)
-        for k, share in enumerate(shares):
-            each = begin.take(new), between.take(slice(k * len(new), (k + 1) * len(new))), end.take(new)
-            uneven |= _uneven_intervals(each, share, inside[new])
+        places = (s[new] + shares * width[new]).ravel()
+        between = limit_rows(path, limits, joints, places)
+        uneven = _uneven_intervals((begin.take(new), between, end.take(new)), shares, inside[new])
         uneven &= width[new] > SETTINGS.shortest * path.length
         cut, middle = new[uneven], np.flatnonzero(uneven)
         s, middle = np.insert(s, cut + 1, places[middle]), len(rows.speed) + middle
         left, right = np.insert(left, cut + 1, middle), np.insert(right, cut, middle)
         rows = Rows(*(np.concatenate(kinds) for kinds in zip(rows, between, strict=True)))
+        steady = np.append(steady, between.steady())
         new = np.sort(np.concatenate([cut + np.arange(len(cut)), cut + np.arange(len(cut)) + 1]))
     with np.errstate(divide="ignore"):
         jerk = 1 / np.maximum(np.abs(begin.jerk[:, :, 0]), np.abs(end.jerk[:, :, 0])).max(axis=1, initial=0.0)
@@ -269,11 +268,11 @@ def _separate(places: Array, nodes: Array) -> Array:
     return s
 
 
-def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
+def _uneven_intervals(places: tuple[Rows, Rows, Rows], fractions: Array, top: Array) -> NDArray[np.bool_]:
     """Return which intervals are too long, because a limit varies too nonlinearly with distance in them. Shape (N,).
 
-    `places` contains the limits at the beginning, at a fraction of the length, and at the end of each interval. `top`
-    are the fastest steady speeds (N,), m/s.
+    `places` contains the limits at the beginning, at fractions (F, 1) of the length, first those of all intervals at
+    the first fraction, and at the end of each interval. `top` are the fastest steady speeds (N,), m/s.
     """
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -281,10 +280,10 @@ def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Arr
         ([rows.acceleration[:, :, 1] for rows in places], top**2, SETTINGS.uneven),
         ([rows.jerk[:, :, 2] for rows in places], top**3, SETTINGS.uneven),
     )
-    uneven = np.zeros(len(top), dtype=bool)
+    uneven, share = np.zeros(len(top), dtype=bool), fractions[:, :, None]
     for (first, inside, last), scale, tolerance in kinds:
-        deviation = np.abs(inside - (1 - fraction) * first - fraction * last) * scale[:, None]
-        uneven |= deviation.max(axis=1, initial=0.0) > tolerance
+        deviation = np.abs(inside.reshape(len(share), *first.shape) - (1 - share) * first - share * last)
+        uneven |= deviation.max(axis=(0, 2), initial=0.0) * scale > tolerance
     return uneven
 
 

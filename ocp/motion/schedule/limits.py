@@ -165,7 +165,8 @@ class LineLimits:
         A joint with a limit of 0 does not move, so that its limits have no effect; see `check_line`.
         """
         values = self._of_joints(count, ("velocity", "acceleration", "jerk"))
-        return np.where(values == 0, np.inf, values)
+        values[values == 0] = np.inf
+        return values
 
     def torques(self, count: int) -> Array:
         """Return the torque limits of `count` joints. Shape (count,)."""
@@ -173,15 +174,14 @@ class LineLimits:
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
         """Return the joint limits named by `names`, such as "jerk", for `count` joints. Shape (len(names), count)."""
-        joints = self.joints or JointLimits()
-        rows = []
-        for name in names:
+        joints, rows = self.joints or JointLimits(), np.empty((len(names), count))
+        for row, name in zip(rows, names, strict=True):
             value = np.asarray(getattr(joints, name), dtype=float)
             if value.ndim and value.shape != (count,):
                 message = f"joint {name} limits have shape {value.shape}; the arm has {count} joints"
                 raise ProblemError(message, name=f"joint {name}", value=value.shape, limit=(count,))
-            rows.append(np.broadcast_to(value, (count,)))
-        return np.array(rows)
+            row[:] = value
+        return rows
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
@@ -349,25 +349,13 @@ class Rows(NamedTuple):
         """Return the coefficients of all limit inequalities at a subset of the points of the path."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
-    def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest permitted constant speed at each point, m/s, and the index of the limit that sets it.
-
-        Shape (S,) each.
-        """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
-            speeds = np.concatenate(
-                [
-                    1 / self.speed,
-                    np.sqrt(np.maximum(available, 0) / np.abs(self.acceleration[:, :, 1])),
-                    np.cbrt(1 / np.abs(self.jerk[:, :, 2])),
-                ],
-                axis=1,
-            )
-        speeds[np.isnan(speeds)] = np.inf
-        if not speeds.shape[1]:
-            return np.full(len(speeds), np.inf), np.zeros(len(speeds), dtype=np.intp)
-        return speeds.min(axis=1), speeds.argmin(axis=1)
+    def steady(self) -> Array:
+        """Return the greatest permitted constant speed at each point, m/s. Shape (S,)."""
+        q, r = self.acceleration[:, :, 1], self.acceleration[:, :, 2]
+        with np.errstate(divide="ignore"):
+            square = (np.maximum(1 - np.sign(q) * r, 0.0) / np.abs(q)).min(axis=1)
+            by_jerk = np.cbrt(1 / np.abs(self.jerk[:, :, 2]).max(axis=1, initial=0.0))
+            return np.asarray(np.minimum(np.minimum(1 / self.speed.max(axis=1), np.sqrt(square)), by_jerk))
 
     @property
     def total(self) -> int:
@@ -443,19 +431,20 @@ def limit_rows(
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
     """Return the coefficients of all limit inequalities at no more than `BLOCK_SIZE` distances along a path."""
-    speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
+    counts = [len(kind) for kind in _names_by_kind(limits, joints)]
+    speed, acceleration, jerk = (np.zeros((len(s), *shape)) for shape in ((counts[0],), (counts[1], 3), (counts[2], 3)))
     if np.isfinite(limits.centripetal):
-        speed[:, 0, 0] = np.sqrt(curvature_along(path, s) / limits.centripetal)
+        speed[:, 0] = np.sqrt(curvature_along(path, s) / limits.centripetal)
     acceleration[:, 0, 0] = 1 / limits.acceleration
     line_jerks = int(np.isfinite(limits.jerk))
     jerk[:, :line_jerks, 0] = 1 / limits.jerk
     k, m, p = 1, 1, line_jerks
     if limits.tool is not None:
         tangent, curvature, rate, turn = tool_along(path, s)
-        speed[:, 1, 0] = np.linalg.norm(turn, axis=1) / limits.tool.turn_rate
+        speed[:, 1] = np.linalg.norm(turn, axis=1) / limits.tool.turn_rate
         each = (limits.tool.acceleration, limits.tool.jerk, limits.tool.velocity)
         accelerations, jerks, velocities = (np.broadcast_to(value, (3,)) for value in each)
-        speed[:, 2:5, 0] = np.abs(tangent) / velocities
+        speed[:, 2:5] = np.abs(tangent) / velocities
         acceleration[:, 1:4, 0], acceleration[:, 1:4, 1] = tangent / accelerations, curvature / accelerations
         jerk[:, p : p + 3] = np.stack([tangent, 3 * curvature, rate], axis=2) / jerks[:, None]
         k, m, p = 5, 4, p + 3
@@ -463,7 +452,7 @@ def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s:
         n = len(joints.names)
         rates, (velocities, accelerations, jerks) = rates_along(joints, s), limits.of_joints(n)
         first, second, third = (np.asarray(values, dtype=float) for values in (rates.first, rates.second, rates.third))
-        speed[:, k:, 0] = np.abs(first) / velocities
+        speed[:, k:] = np.abs(first) / velocities
         acceleration[:, m : m + n, 0], acceleration[:, m : m + n, 1] = first / accelerations, second / accelerations
         if jerk.shape[1] > p:
             jerk[:, p:] = np.stack([first, 3 * second, third], axis=2) / jerks[:, None]
@@ -473,4 +462,4 @@ def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s:
             acceleration[:, m + n :] = values / limits.torques(n)[:, None]
     for rows in (speed, acceleration, jerk):
         rows[np.abs(rows) < NO_COEFFICIENT] = 0.0  # of a joint that stands still but for rounding
-    return Rows(speed[:, :, 0], acceleration, jerk)
+    return Rows(speed, acceleration, jerk)

@@ -429,7 +429,7 @@ def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tup
         usage[:, line_rows] = 0.0
         cause[part], largest = usage.argmax(axis=1), usage.max(axis=1)
         binding[part] &= (largest > ACTIVE_SHARE) & (largest >= line - (1 - ACTIVE_SHARE))
-        steady[part] = np.minimum(*(rows.steady()[0] for rows in sides))
+        steady[part] = np.minimum(*(rows.steady() for rows in sides))
     permitted = np.minimum(steady, grid.requested)
     changes = (np.diff(binding) != 0) | (np.diff(cause) != 0) | (np.diff(grid.requested) != 0)
     edges = np.concatenate([[0], 1 + np.flatnonzero(changes), [len(binding)]])

@@ -214,9 +214,9 @@ class _Bounds(NamedTuple):
         p, q, r = rows
         size = np.abs(p)
         free = size <= NO_INERTIA * size.max(axis=0)
-        inverse = 1 / np.where(free, 1.0, p)
-        middle, reach = -r * inverse, np.where(free, UNBOUNDED, np.abs(inverse))
-        return cls(np.where(free, 0.0, -q * inverse), middle - reach, middle + reach)
+        inverse = np.divide(-1.0, p, out=np.zeros_like(p), where=~free)
+        middle, reach = r * inverse, np.where(free, UNBOUNDED, np.abs(inverse))
+        return cls(q * inverse, middle - reach, middle + reach)
 
     def take(self, places: NDArray[np.intp] | slice) -> _Bounds:
         """Return the bounds at selected points of the path."""
@@ -231,13 +231,13 @@ class _Bounds(NamedTuple):
 
     def feasible(self, caps: Array) -> Array:
         """Return the greatest squared speeds, at most `caps` (P,), at which an acceleration satisfies all bounds."""
-        x, at = caps.copy(), np.flatnonzero(caps > 0)
+        x, at, bounds = caps.copy(), np.arange(len(caps)), self
         while at.size:  # Newton's method on a concave function, from above its root
-            low, high, slope = self.take(at).at(x[at])
-            beyond = low - high > ROUNDING_SHARE * (np.abs(low) + np.abs(high))
+            low, high, slope = bounds.at(x[at])
+            beyond = (low - high > ROUNDING_SHARE * (np.abs(low) + np.abs(high))) & (x[at] > 0)
             at = at[beyond]
             x[at] = np.maximum(x[at] + ((low - high)[beyond] / slope[beyond]), 0.0)
-            at = at[x[at] > 0]
+            bounds = self.take(at)
         return x
 
 

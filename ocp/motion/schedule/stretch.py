@@ -36,11 +36,15 @@ from ocp.motion.schedule.window import (
     parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
-from ocp.motion.tasks.speed_profile import LineMotion, SpeedProfile, join_profiles, profile_between
+from ocp.motion.tasks.speed_profile import SpeedProfile, integrate_jerk, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
 ACTIVE_SHARE = 0.98
 """Fraction of a limit above which it counts as active; limits that no motion can activate are left out at first."""
+
+HALF_ERROR = 0.16
+"""Deviation of a cubic from parabolas through end, Gauss point and middle of an interval, over that of the parabola
+through both ends and the middle, which is largest at the Gauss points."""
 
 
 @dataclass(frozen=True)
@@ -193,34 +197,12 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
-class _Samples:
-    """Coefficients of the limits, without jerk limits, at points on a path to which more can be added.
+def _columns(rows: Rows) -> tuple[Array, Array]:
+    """Return the largest coefficient of the speed, s/m, and the coefficients (p, q, r) of the acceleration limits.
 
-    Attributes:
-        speed: Largest coefficient of the speed in a limit. Shape (P,), s/m.
-        rows: Coefficients (p, q, r) of the limits of the acceleration. Shape (3, R, P).
+    Shapes (P,) and (3, R, P).
     """
-
-    def __init__(self, grid: Grid) -> None:
-        self.grid = grid
-        self.speed, self.rows = self._columns(grid.rows)
-
-    def add(self, places: Array) -> NDArray[np.intp]:
-        """Append the coefficients at distances (M,) along the path to the table; return their column indices."""
-        grid, first = self.grid, len(self.speed)
-        speed, rows = self._columns(limit_rows(grid.path, grid.limits, grid.joints, places))
-        self.speed, self.rows = np.append(self.speed, speed), np.concatenate([self.rows, rows], axis=2)
-        return np.arange(first, len(self.speed))
-
-    def usage(self, motion: LineMotion, places: NDArray[np.intp]) -> Array:
-        """Return the ratio, with sign, of each limited quantity of a motion at M places to its limit. Shape (R, M)."""
-        p, q, r = self.rows[:, :, places]
-        speed = self.speed[places] * motion.speed
-        return np.concatenate([speed[None], p * motion.acceleration + q * motion.speed**2 + r])
-
-    @staticmethod
-    def _columns(rows: Rows) -> tuple[Array, Array]:
-        return rows.speed.max(axis=1), np.ascontiguousarray(rows.acceleration.T)
+    return rows.speed.max(axis=1), np.ascontiguousarray(rows.acceleration.T)
 
 
 def _solve_without_jerk(grid: Grid) -> SpeedProfile:
@@ -232,64 +214,78 @@ def _solve_without_jerk(grid: Grid) -> SpeedProfile:
     Raises:
         ProblemError: A limit is violated in the shortest intervals too, with the distance.
     """
-    s, requested, samples = grid.distance, grid.requested, _Samples(grid)
-    nodes, before, jumps = np.arange(len(s)), len(s) + np.arange(len(grid.before)), grid.jumps - 1
-    shares, between = np.array([[GAUSS[0]], [0.5], [GAUSS[1]]]), np.empty((3, len(requested)), dtype=np.intp)
-    new, inner = np.full(len(requested), True), np.full(len(s), False)
+    s, requested, jumps, count = grid.distance, grid.requested, grid.jumps - 1, len(grid.requested)
+    first, last = (_columns(rows) for rows in grid.ends(0, count))
+    # coefficients at five points of each interval: at its ends, and inside, where they are evaluated in the rounds
+    speed, rows = (np.stack([begin] * 4 + [end], axis=-2) for begin, end in zip(first, last, strict=True))
+    shares, new, inner = np.array([[GAUSS[0]], [0.5], [GAUSS[1]]]), np.full(count, True), np.zeros(0, dtype=np.intp)
     for _ in range(SETTINGS.rounds):
         h = np.diff(s)
         places = s[:-1] + shares * h
-        nodes[inner], added = np.split(samples.add(np.append(s[inner], places[:, new])), [inner.sum()])
-        between[:, new] = added.reshape(3, -1)
-        right = nodes[1:].copy()
-        right[jumps] = before
-        slowest = samples.speed[nodes]
-        slowest[1:] = np.maximum(slowest[1:], samples.speed[right])
-        with np.errstate(divide="ignore"):
-            caps = np.minimum(node_minimum(requested) ** 2, slowest**-2.0)
+        added = limit_rows(grid.path, grid.limits, grid.joints, np.append(s[inner], places[:, new]))
+        for values, of_added in zip((speed, rows), _columns(added), strict=True):
+            values[..., 0, inner] = values[..., 4, inner - 1] = of_added[..., : len(inner)]
+            values[..., 1:4, new] = of_added[..., len(inner) :].reshape(*values.shape[:-2], 3, -1)
+        np.maximum(speed, 1 / requested, out=speed)
+        caps = np.maximum(np.append(speed[0], 0.0), np.insert(speed[4], 0, 0.0)) ** -2.0
         caps[[0, -1]] = 0.0
-        x, *rates = reachability_passes(s, caps, samples.rows[:, :, nodes], (jumps, samples.rows[:, :, before]))
+        at_nodes = np.concatenate([rows[:, :, 0], rows[:, :, 4, -1:]], axis=2)
+        x, *rates = reachability_passes(s, caps, at_nodes, (jumps, rows[:, :, 4, jumps]))
         profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
-        used, peak = _usage_without_jerk(profile, samples, (places, (nodes[:-1], *between, right)), requested)
+        used, peak = _usage_without_jerk(profile, places, speed, rows)
         # the excess falls at least as fast as the length of the interval
         parts = np.clip(np.ceil(2 * (peak - 1) / SETTINGS.exceeded) - 1, 1, SETTINGS.parts).astype(np.intp)
         unused = np.where(used[[0, -1]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[2], 0.0)
         if unused @ np.diff(profile.t) > SETTINGS.unused * profile.duration:
-            parts = np.maximum(parts, 1 + (unused > 2 * SETTINGS.exceeded))
+            # in halves, which gain speed, limits would be violated again
+            parts = np.maximum(parts, np.where(unused > 2 * SETTINGS.exceeded, SETTINGS.parts // 2, 1))
         if not (parts > 1).any():
             return profile
         at = np.repeat(np.arange(len(parts)), parts)
         number = np.arange(len(at)) - (np.cumsum(parts) - parts)[at]
-        s, inner = np.append(s[at] + h[at] * number / parts[at], s[-1]), np.append(number > 0, False)
-        nodes, jumps = np.append(nodes[at], nodes[-1]), np.cumsum(parts)[jumps] - 1
-        requested, between, new = requested[at], between[:, at], parts[at] > 1
+        s, inner = np.append(s[at] + h[at] * number / parts[at], s[-1]), np.flatnonzero(number)
+        jumps, requested, new = np.cumsum(parts)[jumps] - 1, requested[at], parts[at] > 1
+        speed, rows = speed.take(at, axis=-1), rows.take(at, axis=-1)
     worst = int(peak.argmax())
     place, largest = float(profile.distance[worst]), float(peak[worst])
     message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
     raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
 
 
-def _usage_without_jerk(
-    profile: SpeedProfile, samples: _Samples, places: tuple[Array, tuple[NDArray[np.intp], ...]], requested: Array
-) -> tuple[Array, Array]:
+def _usage_without_jerk(profile: SpeedProfile, places: Array, speed: Array, rows: Array) -> tuple[Array, Array]:
     """Return the largest ratio of any quantity except jerk to its limit: at five points and over each interval.
 
-    The points are the start, the first Gauss point, the middle, the second Gauss point and the end. `places` are the
-    distances of the inner points and the indices of all. Each row is interpolated by a parabola through start, middle
-    and end; its error at the Gauss points, where that of a cubic is largest, is added. Shapes (5, N) and (N,).
+    The points are the start, first Gauss point, middle, second Gauss point and end. In either half each row is
+    interpolated by a parabola through three of them; what a cubic may deviate from it is added. Shapes (5, N) and (N,).
+
+    Args:
+        profile: Motion, with one segment in each interval.
+        places: Distances of the inner points along the path. Shape (3, N), m.
+        speed: Largest coefficients of the speed at the five points. Shape (5, N), s/m.
+        rows: Coefficients (p, q, r) of the limits of the acceleration there. Shape (3, R, 5, N).
     """
-    inside, count = profile.at_distance(places[0].ravel()), len(requested)
-    t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
-    first, end = LineMotion(t, s, v, a, profile.jerk), a + profile.jerk * np.diff(profile.t)
-    last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
-    motions = first, *(LineMotion(*(kind[k * count : (k + 1) * count] for kind in inside)) for k in range(3)), last
-    values = np.stack([samples.usage(motion, at) for motion, at in zip(motions, places[1], strict=True)])
-    sizes, speeds = np.abs(values).max(axis=0), np.array([motion.speed / requested for motion in motions])
-    used, three = np.maximum(np.abs(values).max(axis=1), speeds), values[::2]
+    first, last, acceleration, jerk = profile.speed[:-1], profile.speed[1:], profile.acceleration[:-1], profile.jerk
+    covered = places - profile.distance[:-1]
+    share = covered / np.diff(profile.distance)
+    # time at constant acceleration, then Newton steps, which converge quadratically
+    t = 2 * covered / (first + np.sqrt((1 - share) * first**2 + share * last**2))
+    for _ in range(2):
+        reached, v, a = integrate_jerk(first, acceleration, jerk, t)
+        t -= (reached - covered) / v
+    _, v, a = integrate_jerk(first, acceleration, jerk, np.vstack([0 * first, t, np.diff(profile.t)]))
+    p, q, r = rows
+    values = np.concatenate([(speed * v)[None], p * a + q * v**2 + r])
+    sizes = np.abs(values)
+    used = sizes.max(axis=0)
+    # neither a parabola nor a cubic through values below half the limit reaches the limit
+    row, at = np.nonzero(sizes.max(axis=1) > 0.5)
+    high = values[row, :, at].T
     weights = (1 - GAUSS[0]) * (1 - 2 * GAUSS[0]), 4 * GAUSS[0] * (1 - GAUSS[0]), GAUSS[0] * (2 * GAUSS[0] - 1)
-    error = np.abs(np.tensordot([weights, weights[::-1]], three, 1) - values[1::2]).max(axis=0)
-    vertex = np.abs(parabola_peak(three, (0.0, 0.5, 1.0)))
-    return used, np.maximum((np.maximum(vertex, sizes) + error).max(axis=0), speeds.max(axis=0))
+    error = np.abs(np.array([weights, weights[::-1]]) @ high[::2] - high[1::2]).max(axis=0)
+    left, right = parabola_peak(high[:3], (0.0, GAUSS[0], 0.5)), parabola_peak(high[2:], (0.5, GAUSS[1], 1.0))
+    peak = used.max(axis=0)
+    np.maximum.at(peak, at, np.abs([left, right, *high]).max(axis=0) + HALF_ERROR * error)
+    return used, peak
 
 
 def _solve_with_jerk(
@@ -378,7 +374,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
     From rest at a constant jerk J, the squared speed to the power 3/4 grows by sqrt(9/2 J) times the distance; a known
     motion at an end may slow down at the same rate.
     """
-    steady = np.minimum(left.steady()[0], right.steady()[0])
+    steady = np.minimum(left.steady(), right.steady())
     y = (SETTINGS.start * np.minimum(most, node_minimum(steady) ** 2)) ** 0.75
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
