@@ -17,7 +17,7 @@ import numpy as np
 
 import ocp
 from models import Footprint, Standing, Wrench, footprint, with_load
-from models.machines.machine import Wrenches
+from models.machines.machine import WrenchFunction
 from ocp import AccelerationOptions, Collocation, Problem, Scene, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
@@ -61,7 +61,7 @@ def anymal() -> tuple[Standing, Footprint]:
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 
 
-def reaction(machine: Standing) -> Wrenches:
+def reaction(machine: Standing) -> WrenchFunction:
     """What the push does to the hand: the same force, the other way."""
 
     def acting(time: Any, tip: Any) -> Sequence[Wrench]:

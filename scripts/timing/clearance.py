@@ -138,11 +138,9 @@ def ball(plain: Plan, link: str) -> Sphere:
 
 def report(numbers: dict[str, Any]) -> str:
     """The times, and what is asked."""
-    request = (
-        "required: a proof in 0.5 s, plans at most 1.5 times the plain one beside what does not bind, 4 times beside"
-    )
+    request = "required: a proof in 0.5 s, plans at most 1.5 times the plain one beside obstacles that do not bind, "
     tables = "\n".join(text_table(numbers[part], 4) for part in ("rows", "proofs", "peers"))
-    return f"{tables}\n{request} what binds"
+    return f"{tables}\n{request}4 times beside those that do"
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:

@@ -355,10 +355,8 @@ def _wheel_advice(request: PlanRequest, joints: Array) -> str:
         return ""
     names = request.machine.robot.joint_names
     low = ", ".join(f"{light[0][k]:.1e} for {names[k]!r}" for k in np.flatnonzero(light[0] < weights))
-    words = (
-        "; lower weights of the reaction wheels in Cost(weights=...) make motions easier to find, for example so that "
-    )
-    return f"{words}wheels cost no more than the arm: {low}"
+    words = "; lower weights of the reaction wheels in Cost(weights=...) make motions easier to find; they cost no more"
+    return f"{words} than the arm with {low}"
 
 
 def clearance_for(
