@@ -208,13 +208,13 @@ def test_wheels_hold_the_attitude_of_a_published_space_arm_while_its_tip_moves(i
 def test_too_costly_wheels_are_named_with_weights_at_which_they_cost_as_much_as_the_arm() -> None:
     """A wheel of inertia J at 1 rad/s turns a machine of inertia I by J / I about its axis: momentum is conserved."""
     rod = Link("rod", 1e-9, (0, 0, 0), 1e-9 * np.eye(3))
-    links = Link("hub", 60.0, (0, 0, 0), np.diag([4.0, 8.0, 16.0])), rod
+    links = Link("hub", 60.0, (0, 0, 0), np.diag([10.0, 12.0, 16.0])), rod
     body = Robot(links, (Joint("shoulder", "revolute", "hub", "rod"),))
     machine = FreeFloating(with_wheels(body, np.eye(3), 0.02))
     requested = np.array([2.0, 1.0, 1.0, 1e-9])
     weights, light = tracking_weights(machine, machine.base_home(), np.zeros(4), requested)
     np.testing.assert_array_equal(weights, requested)
-    inertias = np.array([4.0, 8.0]) + 0.02 + 2 * 0.6 * 0.02  # the transverse inertia of a disc is 0.6 of its axial one
+    inertias = np.array([10.0, 12.0]) + 0.02 + 2 * 0.6 * 0.02  # the transverse inertia of a disc is 0.6 of its axial one
     np.testing.assert_allclose(light, [2.0, *2.0 * (0.02 / inertias) ** 2, 1e-9], rtol=1e-6)
     costly, start, tasks, _ = held_arm(0.01)
     with pytest.raises(SolveError, match=r"time limit.*lower weights of the reaction wheels.*'wheel3'"):
