@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,13 +214,12 @@ def render(
     cells = np.flatnonzero(faces >= 0)
     _shade(picture, solid, faces, cells, fine, sun=sun)
     nearness[cells[faces[cells] < first]] = np.inf
-    veils: _Nearest | None = None
     for layer in layers:
         for opacity in sorted({part.color[3] for part in layer.parts}, reverse=True):
             if opacity >= 1 and layer.opacity >= 1:
                 continue
             veil = _Mesh.of([part for part in layer.parts if part.color[3] == opacity], layer.tint)
-            near, faces = veils = _nearest(*_project(fine, veil), fine.size, veils)
+            near, faces = _nearest(*_project(fine, veil), fine.size)
             cells = np.flatnonzero(faces >= 0)
             cells = cells[near[cells] > (1 + PICTURE_STYLE.behind) * nearness[cells]]
             _shade(picture, veil, faces, cells, fine, alpha=layer.opacity * opacity)
@@ -268,20 +267,14 @@ def _project(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
     return positions[mesh.faces], (1.0 / depths)[mesh.faces]
 
 
-_Nearest: TypeAlias = tuple[Array, NDArray[np.int32]]
-
-
-def _nearest(places: Array, near: Array, size: tuple[int, int], reused: _Nearest | None = None) -> _Nearest:
+def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
     """Return inverse depth and index of the nearest triangle at each pixel centre; -inf and -1 where there is none.
 
     `places` (f, 3, 2) has the corners of the triangles in pixels from the upper left, `near` (f, 3) their inverse
-    depths, which are linear over a triangle. Pixels are numbered row by row. The arrays of an earlier result are
-    `reused`, as new ones of this size take longer to allocate than most layers to draw.
+    depths, which are linear over a triangle. Pixels are numbered row by row.
     """
     width, height = size
-    depth, number = reused or (np.empty(height * width), np.empty(height * width, dtype=np.int32))
-    depth.fill(-np.inf)
-    number.fill(-1)
+    depth, number = np.full(height * width, -np.inf), np.full(height * width, -1, dtype=np.intp)
     ab, ac = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     top = np.clip(np.ceil(places[..., 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
@@ -409,7 +402,7 @@ def _draw_floor(
 def _shade(
     picture: NDArray[np.float32],
     mesh: _Mesh,
-    faces: NDArray[np.int32],
+    faces: NDArray[np.intp],
     cells: NDArray[np.intp],
     camera: Camera,
     *,

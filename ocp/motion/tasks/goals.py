@@ -251,8 +251,7 @@ class Scene:
         folders: Folders of the robot's meshes.
         missing: "raise" if a mesh is missing, or "skip" to leave it out.
         wrenches: External wrenches on a standing machine: a list of `Wrench`, or a function of time (s) and tip
-            position (m) that returns one, for example `tip_spring`. Give the times of short pushes as `TipTask.breaks`,
-            because solver and audit evaluate the function at samples.
+            position (m) that returns one, for example `tip_spring`. Give the times of short pushes as `TipTask.breaks`.
     """
 
     obstacles: Any = ()
