@@ -214,7 +214,7 @@ def test_too_costly_wheels_are_named_with_weights_at_which_they_cost_as_much_as_
     requested = np.array([2.0, 1.0, 1.0, 1e-9])
     weights, light = tracking_weights(machine, machine.base_home(), np.zeros(4), requested)
     np.testing.assert_array_equal(weights, requested)
-    inertias = np.array([10.0, 12.0]) + 0.02 + 2 * 0.6 * 0.02  # the transverse inertia of a disc is 0.6 of its axial one
+    inertias = np.array([10.0, 12.0]) + 0.02 + 2 * 0.6 * 0.02  # a disc: 0.6 of its axial inertia
     np.testing.assert_allclose(light, [2.0, *2.0 * (0.02 / inertias) ** 2, 1e-9], rtol=1e-6)
     costly, start, tasks, _ = held_arm(0.01)
     with pytest.raises(SolveError, match=r"time limit.*lower weights of the reaction wheels.*'wheel3'"):
