@@ -3,7 +3,14 @@
 from importlib.util import find_spec as _find_spec
 from pathlib import Path as _Path
 
-if _Path(_file := getattr(_find_spec("models"), "origin", None) or "").parent != _Path(__file__).parents[1] / "models":
+if (
+    _Path(
+        _file := (_spec.origin or [*(_spec.submodule_search_locations or ()), ""][0])
+        if (_spec := _find_spec("models"))
+        else ""
+    ).parent
+    != _Path(__file__).parents[1] / "models"
+):
     raise ImportError(
         f"`import models` finds {_file or 'no module'}, not the package that selfmotion installs beside {__file__}. "
         "Rename that file or folder, or exclude the folder of the script from the search for modules: "

@@ -60,6 +60,15 @@ def test_a_module_of_the_same_name_is_reported_with_the_remedy(name: str, script
     assert "PYTHONSAFEPATH=1" in last
 
 
+def test_a_folder_without_modules_is_named_if_it_is_all_that_is_found(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "installed").mkdir()
+    (tmp_path / "installed" / "ocp").symlink_to(ROOT / "ocp")
+    result = run(tmp_path, sys.executable, "-S", "-c", "import ocp", PYTHONPATH="installed", PYTHONSAFEPATH="")
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"ImportError: `import models` finds {tmp_path / 'models'}, not the package that selfmotion")
+
+
 def test_the_remedy_works_and_a_folder_without_modules_does_no_harm(tmp_path: Path) -> None:
     (tmp_path / "models.py").write_text("Robot = None\n")
     result = run(tmp_path, sys.executable, "-P", "-m", "ocp", "--version")

@@ -7,16 +7,17 @@ momentum h = I w at which the wheel saturates gives its speed limit w.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeAlias, cast
 
 import casadi as ca
 import numpy as np
 
 from models.checks import ROUNDING, Array, ArrayInput, require, set_fields, short_repr
 from models.errors import ModelError
+from models.robot.dynamics import Wrench, checked_wrenches
 from models.robot.kinematics import (
     TWIST_SIZE,
     checked_vector,
@@ -258,6 +259,19 @@ def with_wheels(
         transverse = np.eye(3) - np.outer(joint.axis, joint.axis)
         links.append(Link(joint.child, masses[k], (0.0, 0.0, 0.0), inertias[k] * (np.eye(3) - (1 - 0.6) * transverse)))
     return replace(robot, links=tuple(links), joints=tuple(joints))
+
+
+WrenchFunction: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
+Wrenches: TypeAlias = Sequence[Wrench] | WrenchFunction
+"""External wrenches: a list, or a function that returns one from the time, s, and the position of the tip in the world,
+shape (3, 1), m. A wrench names its link and has its force in world axes and its point of application in the link."""
+
+
+def wrenches_at(
+    wrenches: Wrenches, machine: Machine, base: Expression, q: Expression, *, time: Expression
+) -> tuple[Wrench, ...]:
+    """Return the external wrenches on a machine at a configuration and a time; raise ModelError for anything else."""
+    return checked_wrenches(wrenches(time, machine.tip_pose(base, q).position) if callable(wrenches) else wrenches)
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from models.checks import ROUNDING, Array, ArrayInput, require, set_fields
 from models.errors import ModelError
-from models.machines.machine import FixedBase
+from models.machines.machine import FixedBase, Wrenches, WrenchFunction, wrenches_at
 from models.machines.support import Support
 from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
 from models.robot.kinematics import (
@@ -31,19 +31,6 @@ from models.robot.parts import massless_error
 from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, expression
-
-External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
-"""Function from time (s) and the tip's position in the world, shape (3, 1), to a list of external wrenches."""
-
-
-def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return wrenches of `external` at a time and tip position; raise ModelError unless it is a function or None."""
-    if external is None:
-        return ()
-    if not callable(external):
-        message = f"external must be a function of time and tip position, not {external!r}"
-        raise ModelError(message, name="external", value=external)
-    return checked_wrenches(external(time, tip))
 
 
 class ZmpRows(NamedTuple):
@@ -156,22 +143,22 @@ class Standing(FixedBase):
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
         """Return the linear equation for the joint accelerations that puts the zero moment point at `point` (2,), m."""
-        external = external_wrench(self.robot, q, wrenches, self.world_from_base())
+        outside = external_wrench(self.robot, q, wrenches, self.world_from_base())
         point = checked_vector("point", point, 2, "x and y on the ground")
         q, qd = joint_vector(self.robot, q), joint_vector(self.robot, qd, "qd")
-        jacobian, first, second, right = self._zmp_rows(q, qd, point, external)
+        jacobian, first, second, right = self._zmp_rows(q, qd, point, outside)
         return ZmpRows(jacobian, (first, second), right)
 
     @cached_property
     def _zmp_rows(self) -> Any:
         n = self.joint_size
         q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
-        point, external = ca.SX.sym("point", 2), ca.SX.sym("external", 6)
+        point, outside = ca.SX.sym("point", 2), ca.SX.sym("external_wrench", 6)
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
             """Return moments of the ground reaction about `point`, eqs. (11), (12) of Yoo et al. 2004. Shape (2, 1)."""
-            reaction = self.ground_reaction(q, velocity, acceleration) - external
+            reaction = self.ground_reaction(q, velocity, acceleration) - outside
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 
         rest = ca.DM.zeros(n)
@@ -179,7 +166,7 @@ class Standing(FixedBase):
         moving, at_rest = moments(qd, rest), moments(rest, rest)
         planes = [ca.hessian(moving[i], qd)[0] / 2 for i in (0, 1)]
         outputs = [ca.densify(part) for part in (jacobian, *planes, -at_rest)]
-        return ca.Function("zmp_rows", [q, qd, point, external], outputs, {"cse": True})
+        return ca.Function("zmp_rows", [q, qd, point, outside], outputs, {"cse": True})
 
     @cached_property
     def _sampled_points(self) -> Array:
@@ -220,7 +207,7 @@ def center_of_pressure(reaction: Expression) -> Expression:
     return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
 
 
-def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
+def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> WrenchFunction:
     """Return the function that gives the external wrench of a spring at the tip, the force -stiffness (tip - rest).
 
     Args:
@@ -309,15 +296,15 @@ class StandingMotion:
         }
 
 
-def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
+def motion_function(machine: Standing, wrenches: Wrenches = (), rows: Rows = (3, 4, 5)) -> Any:
     """Return the CasADi Function from (time, q, qd, qdd) to the attributes that a `StandingMotion` computes, by name.
 
-    Its symbols are SX, or MX if `external` requires it.
+    Its symbols are SX, or MX if `wrenches` require it.
     """
     try:
-        return _motion_function(machine, external, rows, ca.SX)
+        return _motion_function(machine, wrenches, rows, ca.SX)
     except (RuntimeError, NotImplementedError):  # interpolants and external functions take MX only
-        return _motion_function(machine, external, rows, ca.MX)
+        return _motion_function(machine, wrenches, rows, ca.MX)
 
 
 def standing_motion(
@@ -327,7 +314,7 @@ def standing_motion(
     joint_velocities: ArrayInput,
     *,
     joint_accelerations: ArrayInput,
-    external: External | None = None,
+    wrenches: Wrenches = (),
     rows: Rows = (3, 4, 5),
 ) -> StandingMotion:
     """Compute joint torques, ground reaction and stability of a standing machine from samples of its motion.
@@ -335,6 +322,7 @@ def standing_motion(
     Args:
         t: Times. Shape (M,), s.
         joints, joint_velocities, joint_accelerations: Shape (M, n).
+        wrenches: External wrenches.
         rows: Task of the reported manipulability.
 
     Raises:
@@ -344,7 +332,7 @@ def standing_motion(
     arrays = {"joints": joints, "joint_velocities": joint_velocities, "joint_accelerations": joint_accelerations}
     shape = (len(times), machine.joint_size)
     parts = [require.array(f"motion: {name}", part, shape, entries="numbers") for name, part in arrays.items()]
-    function = motion_function(machine, external, rows)
+    function = motion_function(machine, wrenches, rows)
     return StandingMotion(times, *parts, **evaluate_motion(function, times, *parts[:2], qdd=parts[2]))
 
 
@@ -357,17 +345,16 @@ def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array)
     return {name: value[:, 0] if name in scalars else value for name, value in values.items()}
 
 
-def _motion_function(machine: Standing, external: External | None, rows: Rows, symbols: Any) -> Any:
+def _motion_function(machine: Standing, wrenches: Wrenches, rows: Rows, symbols: Any) -> Any:
     n, robot, placement = machine.joint_size, machine.robot, machine.world_from_base()
     time, q, qd, qdd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n), symbols.sym("qdd", n)
-    tip = machine.tip_pose((), q).position
-    wrenches = wrenches_at(external, time, tip)
-    reaction = machine.ground_reaction(q, qd, qdd, wrenches)
+    acting = wrenches_at(wrenches, machine, (), q, time=time)
+    reaction = machine.ground_reaction(q, qd, qdd, acting)
     point = center_of_pressure(reaction)
-    external_force: Any = sum((ca.densify(wrench.force) for wrench in wrenches), start=ca.DM.zeros(3))
+    external_force: Any = sum((ca.densify(wrench.force) for wrench in acting), start=ca.DM.zeros(3))
     outputs = {
-        "joint_torques": machine.joint_torques(q, qd, qdd, wrenches),
-        "tip_in_world": tip,
+        "joint_torques": machine.joint_torques(q, qd, qdd, acting),
+        "tip_in_world": machine.tip_pose((), q).position,
         "external_force": external_force,
         "center_of_mass": center_of_mass(machine.bodies(), q, placement),
         "ground_force": reaction[3:6],

@@ -17,7 +17,7 @@ import numpy as np
 
 import ocp
 from models import Footprint, Standing, Wrench, footprint, with_load
-from models.machines.standing import External
+from models.machines.machine import WrenchFunction
 from ocp import AccelerationOptions, Collocation, Problem, Scene, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
@@ -61,7 +61,7 @@ def anymal() -> tuple[Standing, Footprint]:
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 
 
-def reaction(machine: Standing) -> External:
+def reaction(machine: Standing) -> WrenchFunction:
     """What the push does to the hand: the same force, the other way."""
 
     def acting(time: Any, tip: Any) -> Sequence[Wrench]:
@@ -87,7 +87,7 @@ def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Proble
     Args:
         changes: Of the other arguments of standing_problem.
     """
-    setup = StandingSetup(external=reaction(machine), tip_level="acceleration", along=along)
+    setup = StandingSetup(wrenches=reaction(machine), tip_level="acceleration", along=along)
     hand = task(machine) if along == "time" else reach(machine)
     options: dict[str, Any] = {"zmp": InFoot(MARGIN), "limits": LIMITS, **changes}
     return standing_problem(machine, hand, SECONDS, start=START, setup=setup, **options)
@@ -102,7 +102,7 @@ def plan(coarse: bool = False) -> StandingExample:
         task(machine),
         SECONDS,
         start=START,
-        external=pressed,
+        wrenches=pressed,
         step=5e-3,
         options=AccelerationOptions(stop_at_lift_off=False),
     ).motion

@@ -18,7 +18,8 @@ import numpy as np
 
 from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint, lock_joints, with_load
 from models.checks import Array
-from models.machines.standing import External, StandingMotion, standing_motion
+from models.machines.machine import Wrenches, WrenchFunction
+from models.machines.standing import StandingMotion, standing_motion
 from models.paths import rest_to_rest
 from ocp import (
     AccelerationOptions,
@@ -66,7 +67,7 @@ class Results:
         footprint: What it stands on, from its file.
         solution: The plan. motion: The same, sampled.
         local: The least-acceleration motion of the same task.
-        external: The rope.
+        wrenches: The rope.
     """
 
     file: Path
@@ -75,7 +76,7 @@ class Results:
     solution: Solution
     motion: StandingMotion
     local: StandingMotion
-    external: External
+    wrenches: WrenchFunction
 
     @property
     def robot(self) -> Robot:
@@ -107,7 +108,7 @@ def tiago(load: float = LOAD) -> tuple[Standing, Footprint]:
     return Standing(robot, support=ground.support, translation=ground.translation, rotation=ground.rotation), ground
 
 
-def rope(machine: Standing) -> External:
+def rope(machine: Standing) -> WrenchFunction:
     """A constant tension towards the anchor."""
 
     def acting(time: Any, tip: Any) -> Sequence[Wrench]:
@@ -148,12 +149,12 @@ def problem(
         weights=WEIGHTS,
         limits=Limits(velocity=SHARE * robot.velocity, torque=SHARE * robot.effort, friction=0.6),
         setup=StandingSetup(
-            external=rope(machine), along=along, tip_level="acceleration", clearance_constraints=clearance_constraints
+            wrenches=rope(machine), along=along, tip_level="acceleration", clearance_constraints=clearance_constraints
         ),
     )
 
 
-def sampled(machine: Standing, solution: Solution, external: External, count: int = 1001) -> StandingMotion:
+def sampled(machine: Standing, solution: Solution, wrenches: Wrenches, count: int = 1001) -> StandingMotion:
     """A plan at equal times."""
     share = np.linspace(0.0, 1.0, count)
     values = solution.at_fraction(share)
@@ -164,7 +165,7 @@ def sampled(machine: Standing, solution: Solution, external: External, count: in
         joints,
         velocities,
         joint_accelerations=accelerations,
-        external=external,
+        wrenches=wrenches,
         rows=ROWS,
     )
 
@@ -178,7 +179,7 @@ def plan() -> Results:
         from_rest(circle(machine)),
         SECONDS,
         start=START,
-        external=pulled,
+        wrenches=pulled,
         step=5e-3,
         options=AccelerationOptions(stop_at_lift_off=False),
     ).motion
@@ -224,7 +225,7 @@ def figure(
         low = 1.5 * 1000 * min(0.0, float(results.local.foot_margin.min()), float(results.motion.foot_margin.min()))
         edge.axhspan(0.0, 1000.0, color=COLORS["grey"], alpha=0.2, lw=0)
         edge.annotate("tips over", (0.03, low), xycoords=("axes fraction", "data"), fontsize=7, va="bottom")
-        edge.set(title="its distance to the edge", xlabel="time, s", ylabel="mm", xlim=span)
+        edge.set(title="distance to the edge of the support", xlabel="time, s", ylabel="mm", xlim=span)
         edge.legend(fontsize=7, loc="upper left")
         edge.set_ylim(low, 1.3 * 1000 * max(results.local.foot_margin.max(), results.motion.foot_margin.max()))
         _shares(shares, results, kinds, prefix)
@@ -260,4 +261,4 @@ def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
     ax.tick_params(axis="y", labelsize=7)
-    ax.set(title="largest share of a limit", xlabel="bars: torque, ◆: velocity")
+    ax.set(title="largest value / limit", xlabel="bars: torque, ◆: velocity")

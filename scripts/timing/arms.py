@@ -370,13 +370,13 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
             if mine:
                 times, misfits = ([row[key] for row in mine] for key in ("seconds", "misfit_m"))
                 left.loglog(times, misfits, marker=mark, color=drawing.COLORS[color], ms=4, label=name)
-        left.set(xlabel="time, s", ylabel="largest misfit of the tip, m", title="local motion")
+        left.set(xlabel="time, s", ylabel="largest position error of the tip, m", title="local motion")
         left.legend()
         for row, color in zip(numbers["postures"], ("blue", "sky", "orange"), strict=False):
             middle.semilogx(
                 1e3 * row["seconds"], 100 * row["found"], "o", color=drawing.COLORS[color], label=row["tool"]
             )
-        middle.set(xlabel="time a pose, ms", ylabel="found, %", title="postures", ylim=(0, 105))
+        middle.set(xlabel="time a pose, ms", ylabel="poses solved, %", title="inverse kinematics", ylim=(0, 105))
         middle.legend(loc="lower right")
         for name, color, mark in (("toppra", "green", "^"), ("ruckig", "purple", "s")):
             if rows := numbers[name]:
@@ -384,5 +384,7 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
                 right.loglog(
                     theirs, [row["seconds"] for row in rows], mark, color=drawing.COLORS[color], ms=4, label=name
                 )
-        right.set(xlabel="time of the peer, s", ylabel="time of the package, s", title="timing")
+        right.set(
+            xlabel="duration by the other library, s", ylabel="duration by selfmotion, s", title="timing of paths"
+        )
         right.legend()

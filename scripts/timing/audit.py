@@ -104,7 +104,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         "IPOPT with MUMPS, the solve without the build, from the problem's own guess; the audit with its default "
         "limits. Dotted: linear growth from the audit's first time. Medians of one run on one machine."
     )
-    title = f"The audit takes at most {summary['worst_ratio_to_whole']:.2f} of the solve with its build that it checks"
+    title = f"The audit takes at most {summary['worst_ratio_to_whole']:.2f} of the time to build and solve the problem"
     with drawing.sheet(path, (2, 2), (7.0, 5.9), note, title=title, sharex=True, sharey=True) as (_, axes):
         for axis, case in zip(axes.ravel(), CASES, strict=True):
             rows = [row for row in summary["rows"] if row["case"] == case]

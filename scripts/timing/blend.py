@@ -326,7 +326,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
     exact = [row["ns_per_sample"] for row in rows if row["worst_error_um"] < 1e-3]
     title = "toppra slows down or overshoots on the blends"
     if exact:
-        title = f"A place on the curve takes {min(exact):.0f} ns, right to rounding; {title}"
+        title = f"A position on the curve takes {min(exact):.0f} ns, exact to rounding; {title}"
     with drawing.sheet(path, (1, 2), (10.4, 5.4), note, title=title, width_ratios=(1.25, 1)) as (_, axes):
         ax = axes[0, 0]
         shades = ["blue" if "compiled" in row["method"] else "sky" for row in rows]
@@ -338,7 +338,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
         least_ns, most_ns = rows[-1]["ns_per_sample"], rows[0]["ns_per_sample"]
         ax.set_xlim(least_ns / 3, 300 * most_ns)
         ax.axvline(TARGET_NS, color=drawing.COLORS["orange"], ls="--", label=f"target of the default, {TARGET_NS:g} ns")
-        ax.set(xlabel="time of one sample, ns", title="From distance to place on the curve")
+        ax.set(xlabel="time of one sample, ns", title="From arc length to position on the curve")
         ax.legend(loc="upper right")
         ax = axes[0, 1]
         ours = summary["profiles"]["ours"]

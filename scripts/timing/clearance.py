@@ -138,9 +138,9 @@ def ball(plain: Plan, link: str) -> Sphere:
 
 def report(numbers: dict[str, Any]) -> str:
     """The times, and what is asked."""
-    request = "asked: a proof in 0.5 s, plans at most 1.5 times the plain one beside what does not bind, 4 times beside"
+    request = "required: a proof in 0.5 s, plans at most 1.5 times the plain one beside obstacles that do not bind, "
     tables = "\n".join(text_table(numbers[part], 4) for part in ("rows", "proofs", "peers"))
-    return f"{tables}\n{request} what binds"
+    return f"{tables}\n{request}4 times beside those that do"
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:
@@ -153,7 +153,7 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
     )
     rows, proven = numbers["rows"], numbers["proofs"]
     worst = max(row["ratio"] for row in rows)
-    title = f"Staying clear costs up to {worst:.1f} times the plan that looks at nothing"
+    title = f"With collision avoidance, planning takes up to {worst:.1f} times as long as without"
     with drawing.sheet(path, (1, 2), (7.6, 3.0), note, title=title) as (_, axes):
         left, right = np.ravel(axes)
         names = [f"{row['robot']}, {row['plan']}" for row in rows]

@@ -1,4 +1,4 @@
-"""Ways through the poses of a public benchmark of redundant arms, beside Descartes: length, time and memory.
+"""Paths through the poses of a public benchmark of redundant arms, beside Descartes: length, time and memory.
 
 Every run is a process of its own, whose processor time and memory are limited; what it leaves is judged by the rules of
 the benchmark with Pinocchio and coal. `python -m scripts.timing.waypoints PROBLEM FOLDER` is one run of ours.
@@ -117,7 +117,7 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
         f"{numbers['memory_gb']} GB."
     )
     valid = {by: sum(1 for row in numbers["rows"] if (row["by"], row["verdict"]) == (by, "valid")) for by in kinds}
-    title = f"Ways through waypoints: {valid.get(OURS, 0)} problems solved, by Descartes at most " + str(
+    title = f"Paths through waypoints: {valid.get(OURS, 0)} problems solved, by Descartes at most " + str(
         max((count for by, count in valid.items() if by != OURS), default=0)
     )
     with drawing.sheet(path, (1, 2), (8.4, 3.9), note, title=title) as (figure, axes):

@@ -48,7 +48,7 @@ WRONG = {
     ("urdf =", "urfd ="): ("line 2", "urdf"),
     ("ur5_robot.urdf", "no.urdf"): ("line 2", "no file", "the robot's URDF"),
     ("tool0", "tool9"): ("line 3", "did you mean 'tool0'"),
-    ("[path]", "[way]"): ("line 4", "path"),
+    ("[path]", "[paht]"): ("line 4", "did you mean path"),
     ("0.55, 0.15, 0.32]", "0.55, 0.15]"): ("line 5", "three numbers"),
     ("speed = 0.05", "speed = -1"): ("line 6", "a number above 0, m/s"),
     ("speed = 0.05", 'speed = "slow"'): ("line 6", "a number above 0, m/s"),

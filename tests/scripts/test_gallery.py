@@ -167,9 +167,9 @@ def test_the_load_on_the_pushing_hand_is_the_reaction_of_its_force() -> None:
     task, options = pushing.task(machine), AccelerationOptions(stop_at_lift_off=False)
     pressed, free = (
         resolve_accelerations(
-            machine, task, pushing.SECONDS, start=pushing.START, external=external, step=1e-2, options=options
+            machine, task, pushing.SECONDS, start=pushing.START, wrenches=wrenches, step=1e-2, options=options
         ).motion
-        for external in (pushing.reaction(machine), None)
+        for wrenches in (pushing.reaction(machine), ())
     )
     aside = pressed.zero_moment_point[0, 1] - free.zero_moment_point[0, 1]
     lever = -pushing.PUSH[1] * pressed.tip_in_world[0, 2]

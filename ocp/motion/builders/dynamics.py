@@ -21,6 +21,7 @@ import numpy as np
 
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, find_wheels
 from models.checks import NOT_NUMBERS, Array, floats
+from models.machines.machine import Wrenches, wrenches_at
 from models.robot.dynamics import GRAVITY, Wrench, inverse_dynamics
 from models.spatial import quaternion_product
 from ocp.console import interruptible
@@ -243,7 +244,8 @@ class DynamicsSetup:
             joined to another. Shape (base_size,).
         end_base: Configuration of a floating base at the end, nan where free. A quaternion is given as a whole or not
             at all. Shape (base_size,).
-        friction, wrenches, gravity: Arguments of `joint_torques`.
+        friction, gravity: Arguments of `joint_torques`.
+        wrenches: External wrenches on an arm on a fixed base: a list, or a function of time and tip position.
         control: "acceleration", or "jerk" for continuous accelerations, zero at ends at rest.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
         symbols: casadi.SX, or casadi.MX if a task calls an interpolant.
@@ -254,7 +256,7 @@ class DynamicsSetup:
     start_base: Any = None
     end_base: Any = None
     friction: JointFriction | None = None
-    wrenches: Sequence[Wrench] = ()
+    wrenches: Wrenches = ()
     gravity: Any = None
     control: Literal["acceleration", "jerk"] = "acceleration"
     clearance_constraints: ClearanceConstraints | None = None
@@ -327,8 +329,8 @@ def dynamics_problem(
     motion, jerks = _declare_motion(problem, machine, ends, bounds, duration, control)
     if setup.end_base is not None:
         _declare_end_base(problem, machine, motion[0], setup.end_base)
-    loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
-    torques = joint_torques(machine, motion, **loads)
+    wrenches = wrenches_at(setup.wrenches, machine, *motion[:2], time=problem.time)
+    torques = joint_torques(machine, motion, friction=setup.friction, wrenches=wrenches, gravity=setup.gravity)
     limit_torques(problem, machine.robot, torques, bounds.torque)
     running = running_cost(machine, cost, motion, jerks=jerks, torques=torques)
     if cost.energy or np.isfinite(bounds.power).any():

@@ -17,7 +17,8 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array
-from models.machines.standing import External, Standing, StandingMotion, evaluate_motion, motion_function, wrenches_at
+from models.machines.machine import Wrenches, wrenches_at
+from models.machines.standing import Standing, StandingMotion, evaluate_motion, motion_function
 from models.robot.dynamics import momentum
 from models.robot.kinematics import center_of_mass_motion, joint_limit_index, manipulability_of
 from ocp.console import interruptible
@@ -161,7 +162,7 @@ def accelerations(
     law: Law,
     state: tuple[Any, Any, Any],
     *,
-    external: External | None = None,
+    wrenches: Wrenches = (),
     options: AccelerationOptions | None = None,
 ) -> Any:
     """Return the joint accelerations that a redundancy resolution law commands. Shape (n, 1).
@@ -171,15 +172,15 @@ def accelerations(
             ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
             augmented, with the centre of mass commanded in their null space.
         state: Time, joint positions and joint velocities, symbols of one kind.
-        external: External wrenches as a function of time and tip position.
+        wrenches: External wrenches: a list, or a function of time and tip position.
     """
     (time, q, qd), own = state, options or AccelerationOptions()
     directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
-    wrenches = wrenches_at(external, time, machine.tip_pose((), q).position)
+    acting = wrenches_at(wrenches, machine, (), q, time=time)
     jacobian = equations.jacobian(no_base, q)
     task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), progress=(time,))
     place = own.zmp_target(machine)(time)
-    zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
+    zmp_rows = machine.zmp_rows(q, qd, place, acting)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
 
     hierarchy = _TaskHierarchy(machine.joint_size)
@@ -234,7 +235,7 @@ class Stop:
     """Reason why a simulated motion ends before its horizon, and the time at which it ends.
 
     ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed limit.
-    ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `external` is not a number.
+    ``breakdown``: accelerations, states or forces are not finite: a task cannot be done, or `wrenches` are no numbers.
     """
 
     reason: Literal["lift_off", "divergence", "breakdown"]
@@ -290,7 +291,7 @@ def resolve_accelerations(
     *,
     start: Any,
     law: Law = "pseudo_inverse",
-    external: External | None = None,
+    wrenches: Wrenches = (),
     step: float = 1e-3,
     options: AccelerationOptions | None = None,
 ) -> AccelerationSolution:
@@ -301,7 +302,7 @@ def resolve_accelerations(
         horizon, step: Final time, and step of the integration and between samples, s.
         start: Start configuration, shape (n,), rad or m, or a `Start` with the joints and their velocities.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
-        external: External wrenches as a function of time and tip position.
+        wrenches: External wrenches: a list, or a function of time and tip position.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.
@@ -321,7 +322,7 @@ def resolve_accelerations(
 
     def law_function(symbols: Any) -> Any:
         time, q, qd = state = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)
-        qdd = accelerations(machine, equations, law, state, external=external, options=own)
+        qdd = accelerations(machine, equations, law, state, wrenches=wrenches, options=own)
         gap = ca.norm_2(equations.error(ca.DM(0, 1), q, equations.targets(time)))
         return ca.Function("law", [time, q, qd], [ca.densify(qdd), gap], {"cse": True})
 
@@ -338,7 +339,7 @@ def resolve_accelerations(
 
     one_step = ca.Function("step", [state, time], [rk4_step(rate, state, width)])
     advance = cache(lambda count: one_step.mapaccum("steps", count))
-    outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
+    outputs = motion_function(machine, wrenches, lambda q: equations.jacobian(ca.DM(0, 1), q))
     states, done = np.concatenate([joints, velocities])[None, :], 0
     first, stopped = _samples(outputs, function, np.zeros(1), states, own)
     records = [first]

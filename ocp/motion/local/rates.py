@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models import CollisionScene, Machine
+from models import CollisionScene, FreeFloating, Machine, find_wheels
 from models.checks import Array, real
 from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
@@ -308,9 +308,13 @@ class LocalMotion:
     def through(cls, times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
         """Return motions through configurations (K, M, n) at times (M,); their rates are forward differences."""
         rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
-        cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
         rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
-        return cls(times, base, joints, rates, np.asarray(cost), zeros, zeros)
+        return cls(times, base, joints, rates, zeros, zeros, zeros).with_cost(weights)
+
+    def with_cost(self, weights: Array) -> LocalMotion:
+        """Return these motions with the costs that follow from weights (n,) of the squared joint rates."""
+        cost = np.einsum("kmn,n,m->k", self.rates[:, :-1] ** 2, weights, np.diff(self.t)) / 2
+        return replace(self, cost=np.asarray(cost))
 
     @classmethod
     def joined(cls, motions: Sequence[LocalMotion]) -> LocalMotion:
@@ -329,6 +333,24 @@ class LocalMotion:
         """Return the motions with the given indices."""
         fields = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
         return LocalMotion(self.t, *(value[rows] for value in fields))
+
+
+def tracking_weights(machine: Machine, base: Array, joints: Array, weights: Array) -> list[Array]:
+    """Return the weights of the joint rates, shape (n,), with which a local motion is tried, one after the other.
+
+    They are the given weights and, if these make reaction wheels costly, smaller weights of the wheels. With costly
+    wheels a local motion lets the arm hold the attitude of its base, which often ends at a singularity. With the
+    smaller weights, wheels that stop a rotation of the base cost no more than an arm joint of the same rate.
+    """
+    if not isinstance(machine, FreeFloating):
+        return [weights]
+    light, columns = weights.copy(), [machine.robot.joint_names.index(name) for name in find_wheels(machine.robot)]
+    others = np.delete(weights, columns)
+    for column, rates in zip(columns, np.eye(len(weights))[columns], strict=True):
+        twist = machine.base_twist(base, joints, rates) - machine.base_twist(base, joints, 0 * rates)
+        turning = np.linalg.norm(np.array(ca.DM(twist))[: twist.numel() // 2])  # of the base, per rate of the wheel
+        light[column] = min(weights[column], turning**2 * others[others > 0].min(initial=np.inf))
+    return [weights] if np.array_equal(light, weights) else [weights, light]
 
 
 def track_tasks(

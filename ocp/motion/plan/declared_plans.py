@@ -10,7 +10,7 @@ import numpy as np
 
 from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance, Standing
 from models.checks import Array, floats
-from models.machines.standing import External
+from models.machines.machine import Wrenches
 from ocp.console import time_left
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -237,15 +237,13 @@ def plan_to_stand(
     options: PlanOptions,
     *,
     constraints: ClearanceConstraints | None,
-    wrenches: External | None,
+    wrenches: Wrenches,
 ) -> SolvedPlan:
     """Plan a motion of a standing machine that satisfies the tasks and keeps the zero moment point inside the foot.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
     leads to a plan.
-
-    `wrenches` are external wrenches as a function of time and tip position, or None.
 
     Raises:
         ProblemError: A cyclic motion, tasks that are active only a part of the time, a horizon that is no number, or as
@@ -273,7 +271,7 @@ def plan_to_stand(
     setup = StandingSetup(
         start_velocity="rest" if are_at_rest(equations, 0.0) else "free",
         end_velocity="rest" if are_at_rest(equations, duration) else "free",
-        external=wrenches,
+        wrenches=wrenches,
         clearance_constraints=constraints,
         symbols=on_symbols(accepted),
     )

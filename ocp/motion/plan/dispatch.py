@@ -134,14 +134,15 @@ def plan(
             if time_limit is None:  # that of an outer call
                 raise
             words = f"no motion was found within the time limit of {time_limit:g} s; raise time_limit"
+            words += "".join(error.args[1:])  # advice of the planner
             raise SolveError(words, name="time_limit", limit=time_limit) from error
 
 
 def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanOptions) -> Plan:
     """Select the planner for the tasks, and call this planner with the arguments of `plan`."""
     cyclic = options.cyclic or None
-    wrenches = scene.wrenches if isinstance(scene, Scene) else None
-    if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
+    wrenches = scene.wrenches if isinstance(scene, Scene) else ()
+    if wrenches and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
         words = "scene: wrenches act on a machine that stands and does tasks; for an arm on a fixed base, give them in "
         words += "DynamicsSetup(wrenches=...) of dynamics_problem"
         raise ProblemError(words, name="wrenches", value=wrenches)
@@ -319,8 +320,8 @@ def plan_problem(
         return _goal_problem(machine, goals, horizon, start=start, cost=own, **shared)
     _, joints, base = Start.of(start, machine)
     if isinstance(machine, Standing):
-        wrenches = scene.wrenches if isinstance(scene, Scene) else None
-        setup = StandingSetup(external=wrenches, clearance_constraints=constraints)
+        wrenches = scene.wrenches if isinstance(scene, Scene) else ()
+        setup = StandingSetup(wrenches=wrenches, clearance_constraints=constraints)
         options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
     own = Cost() if own is None else require.instance("cost", own, Cost)

@@ -20,13 +20,13 @@ import numpy as np
 
 from models import CollisionScene, Machine
 from models.checks import Array
-from ocp.console import report
+from ocp.console import TimeLimitReached, report
 from ocp.errors import ProblemError, SolveError, problem_errors, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import checked_motors
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.local.rates import LocalMotion
+from ocp.motion.local.rates import LocalMotion, tracking_weights
 from ocp.motion.plan.actuators import cost_of_motion, limits_actuators, weights_actuators, without_actuators
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
@@ -328,11 +328,26 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
     solver = CandidateSolver(request, start, configurations[0])
     try:
         result, bound = plan_from_configurations(request, configurations, solver)
+    except TimeLimitReached as error:
+        raise TimeLimitReached(str(error), _wheel_advice(request, configurations[0])) from error
     except (SolveError, Unreachable) as error:
+        if isinstance(error, SolveError):
+            error.args = (f"{error}{_wheel_advice(request, configurations[0])}",)
         raise restore_error(error, request) from error.__cause__
     if bound is None or (request.cost is not None and not request.cost.velocity):
         return result
     return replace(result, bound=checked_bound(bound, result.cost))
+
+
+def _wheel_advice(request: PlanRequest, joints: Array) -> str:
+    """Return which weights to lower if reaction wheels are so costly that motions are hard to find, else ""."""
+    weights, *light = tracking_weights(request.machine, request.base, joints, request.weights)
+    if not light:
+        return ""
+    names = request.machine.robot.joint_names
+    low = ", ".join(f"{light[0][k]:.1e} for {names[k]!r}" for k in np.flatnonzero(light[0] < weights))
+    words = "; lower weights of the reaction wheels in Cost(weights=...) make motions easier to find; they cost no more"
+    return f"{words} than the arm with {low}"
 
 
 def clearance_for(

@@ -24,8 +24,7 @@ import numpy as np
 
 from models import FixedBase, Machine, Stance, Standing, with_load
 from models.checks import Array
-from models.machines.machine import hold_joints
-from models.machines.standing import wrenches_at
+from models.machines.machine import hold_joints, wrenches_at
 from ocp.audit.clearance import Clearance, clearance_of_pairs
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
@@ -412,13 +411,12 @@ def _loads(machine: Machine, arguments: Mapping[str, Any]) -> Sampler:
     torques, reactions = list[Any](), list[Any]()
     each: Any
     for each in (machine, loaded):
+        wrenches = wrenches_at(getattr(setup, "wrenches", ()), machine, base, q, time=time)
         if isinstance(each, Standing):
-            wrenches = wrenches_at(getattr(setup, "external", None), time, machine.tip_pose((), q).position)
             torques.append(each.joint_torques(q, v, a, wrenches))
             reactions.append(each.ground_reaction(q, v, a, wrenches))
         else:
             forces = {name: getattr(setup, name, None) for name in ("friction", "gravity")}
-            wrenches = getattr(setup, "wrenches", ())
             torques.append(joint_torques(each, (base, q, v, a), wrenches=wrenches, **forces))
             reactions.append(symbols(0, 1))
     return Sampler([base, q, v, a, time], [*torques, *reactions])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -24,7 +25,7 @@ from ocp.motion.local.inverse_kinematics import (
     inverse_kinematics,
     inverse_kinematics_at,
 )
-from ocp.motion.local.rates import LocalMotion, track_tasks
+from ocp.motion.local.rates import LocalMotion, track_tasks, tracking_weights
 from ocp.motion.search.joint_space import all_turns, turning_joints, whole_turns_between, whole_turns_into
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
@@ -278,7 +279,8 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
 def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
     """Track the tasks by resolved-rate control within limits, with the least damping at which a motion succeeds."""
     settings, least_damped = request.settings, list[LocalMotion]()
-    for damping in settings.dampings:
+    all_weights = tracking_weights(request.machine, request.base, configurations[0], request.weights)
+    for weights, damping in product(all_weights, settings.dampings):
         motions: list[LocalMotion] = []
         base, joints = np.tile(request.base, (len(configurations), 1)), configurations
         for stretch in request.stretches:
@@ -291,9 +293,10 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
             if (equations := stretch.equations) is None:
                 motions.append(LocalMotion.stationary(times, base, joints))
             else:
-                options: dict[str, Any] = {"weights": request.weights, "damping": damping}
+                options: dict[str, Any] = {"weights": weights, "damping": damping}
                 times = resolving_times(equations, times)
-                motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
+                tracked = track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options)
+                motions.append(tracked.with_cost(request.weights))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
         if largest_pose_errors(motions).min() <= REACH_TOLERANCE:
             return motions

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from models import Box, Machine, Sphere
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
+from models.machines.machine import Wrenches
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.checks import checked_configuration, checked_weights
 from ocp.motion.tasks.tip_task import TipTask
@@ -239,8 +240,8 @@ class Scene:
         srdf: SRDF file whose disabled pairs are ignored; None for none.
         folders: Folders of the robot's meshes.
         missing: "raise" if a mesh is missing, or "skip" to leave it out.
-        wrenches: External wrenches on a standing machine, a function of time (s) and tip position (m) that returns a
-            sequence of `Wrench`, for example `tip_spring`; None for none.
+        wrenches: External wrenches on a standing machine: a list of `Wrench`, or a function of time (s) and tip
+            position (m) that returns one, for example `tip_spring`. Give the times of short pushes as `TipTask.breaks`.
     """
 
     obstacles: Any = ()
@@ -249,7 +250,7 @@ class Scene:
     srdf: Any = None
     folders: Any = ()
     missing: Literal["raise", "skip"] = "raise"
-    wrenches: Callable[[Any, Any], Sequence[Any]] | None = None
+    wrenches: Wrenches = ()
 
     __repr__ = short_repr
 

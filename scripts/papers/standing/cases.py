@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import STANDING_STARTS, Standing, standing_example
-from models.machines.standing import External, StandingMotion, tip_spring
+from models.machines.machine import Wrenches
+from models.machines.standing import StandingMotion, tip_spring
 from ocp import AccelerationOptions, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import motion_cost
 from ocp.motion.local.accelerations import Law, Layer, Stabiliser
@@ -176,7 +177,7 @@ def table_task(table: int) -> TipTask:
     return led(lambda t: [y + 0.2 * (1 - ca.cos(t)), z])
 
 
-def spring() -> External:
+def spring() -> Wrenches:
     """Along y, relaxed where the tip of Table 2 starts."""
     return tip_spring(machine(), (0, STIFFNESS, 0), start_tip(2))
 
@@ -187,11 +188,11 @@ def run_case(case: Case) -> Local:
     if case.printed:
         motion, gap = printed_law(machine(), task, start, HORIZON)
         return Local(case, motion, motion, motion_cost(motion), gap, *fails(motion), None)
-    external = spring() if case.spring else None
+    wrenches = spring() if case.spring else ()
 
     def run(options: AccelerationOptions) -> Any:
         return resolve_accelerations(
-            machine(), task, HORIZON, start=start, law=case.law, external=external, options=options
+            machine(), task, HORIZON, start=start, law=case.law, wrenches=wrenches, options=options
         )
 
     completed = run(case.options)

@@ -93,7 +93,7 @@ def _compared(path: Path, title: str, shown: Sequence[Curve], quantities: Sequen
             for ax in row if quantity is FORCE else ():
                 ax.axhspan(ax.get_ylim()[0], 0.0, color=COLORS["grey"], alpha=0.18, lw=0)
                 ax.text(0.02, 0.06, "lifts off", transform=ax.transAxes, fontsize=7.5)
-        axes[0, 0].set_title("as the local laws fail")
+        axes[0, 0].set_title("until the local methods fail")
         axes[0, 1].set_title("the whole motion")
         legend_below(fig, lines, 2)
 
@@ -143,7 +143,7 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         motion = plan.motion
         left.plot(motion.tip_in_world[:, 1] - rest, motion.external_force[:, 1], color=COLORS["blue"])
         left.set(xlabel="tip beyond its start, m", ylabel="force on the tip, N")
-        left.set_title("along the tip's way")
+        left.set_title("along the path of the tip")
         curves(right, [curve_of(plan, "blue", 0)], lambda m: m.external_force[:, 1])
         right.set(xlabel="time, s", ylabel="force on the tip, N", xlim=(0.0, HORIZON), title="in the task of Table 2")
 

@@ -168,7 +168,7 @@ def _problem(task: Task, rule: ZmpRule, tip_level: Literal["position", "accelera
         setup = StandingSetup(tip_level=tip_level, along="parameter")
         options: dict[str, Any] = {"zmp": rule, "limits": LIFT_LIMITS, "weights": LIFT_WEIGHTS, "setup": setup}
         return standing_problem(machine(), tips, FreeTime(0.2, 3.0, 1.0), start=start, **options)
-    setup = StandingSetup(tip_level=tip_level, external=spring() if task == "table2" else None)
+    setup = StandingSetup(tip_level=tip_level, wrenches=spring() if task == "table2" else ())
     return standing_problem(machine(), tips, HORIZON, start=start, zmp=rule, limits=LIMITS, setup=setup)
 
 
@@ -215,9 +215,9 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
     values = solution.at_fraction(fractions)
     times = fractions * solution.horizon
     q, qd, qdd = values["joints"], values["velocities"], values["accelerations"]
-    external = spring() if request.task == "table2" else None
+    wrenches = spring() if request.task == "table2" else ()
     progress = values["path"][:, 0] if request.task == "minimum_time" else times
-    return standing_motion(machine(), times, q, qd, joint_accelerations=qdd, external=external, rows=ROWS), progress
+    return standing_motion(machine(), times, q, qd, joint_accelerations=qdd, wrenches=wrenches, rows=ROWS), progress
 
 
 def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:

@@ -250,10 +250,10 @@ def test_a_sampled_motion_is_evaluated_point_by_point(case: Case) -> None:
     q, qd, qdd = rng.normal(size=(3, 4, machine.joint_size))
     t, pull = np.array([0.0, 0.1, 0.3, 0.7]), rng.normal(size=3)
 
-    def external(time: Any, tip: Any) -> list[Wrench]:
+    def wrenches(time: Any, tip: Any) -> list[Wrench]:
         return [machine.tip_wrench(time * ca.DM(pull) - 2 * tip)]
 
-    result = standing_motion(machine, t, q, qd, joint_accelerations=qdd, external=external)
+    result = standing_motion(machine, t, q, qd, joint_accelerations=qdd, wrenches=wrenches)
     for k in range(4):
         push = t[k] * pull - 2 * flat(machine.tip_pose((), q[k]).position)
         motion = q[k], qd[k], qdd[k], [machine.tip_wrench(push)]

@@ -8,6 +8,7 @@ requested durations fails, too. Otherwise the coarse solution is the guess.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +21,7 @@ from models.machines.standing import Standing
 from ocp.audit.audit import Audit
 from ocp.console import interruptible, time_left
 from ocp.direct.discretisation import Collocation, MultipleShooting
-from ocp.errors import ProblemError, SolveError, SolverStatus, require
+from ocp.errors import ProblemError, RefinementWarning, SolveError, SolverStatus, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance
 from ocp.motion.builders.dynamics_plan import SolveSettings, audit_error
@@ -33,6 +34,7 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem
+from ocp.refinement import refine
 from ocp.solution import Solution
 from ocp.tightening import tighten
 
@@ -209,7 +211,8 @@ def solve_standing(
     The first plan that passes its audit with pose errors below 1e-5 (m, rad) everywhere is returned. Accelerations at
     the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
     are at the points. If the only failures of a plan are limits exceeded between the points, these limits are tightened
-    there. Other plans are solved again from themselves on up to two meshes, each twice as fine.
+    there. Then the first mesh is refined where the audit finds errors, such as at a short push. Other plans are solved
+    again from themselves on up to two meshes, each twice as fine.
 
     The `tip_level` of the setup is chosen here, and the `control` of a given mesh selects the only formulation tried.
 
@@ -340,6 +343,12 @@ def _attempts(
         if exceeded:
             tightened = partial(tighten, problem, mesh, options=settings, guess=guess)
             yield f"{name}, tightened", judge(f"{name}, tightened", problem, tightened)[0]
+        if k == 0:  # equal intervals as narrow as the shortest event, a push, would be far more
+            refined = partial(refine, problem, mesh, options=settings, guess=guess)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RefinementWarning)
+                attempt, _ = judge(f"{name}, refined", problem, refined)
+            yield f"{name}, refined", attempt
         mesh = mesh.halve()
 
 

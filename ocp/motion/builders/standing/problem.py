@@ -17,7 +17,8 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array, real
-from models.machines.standing import External, Standing, StandingMotion, center_of_pressure, wrenches_at
+from models.machines.machine import Wrenches, wrenches_at
+from models.machines.standing import Standing, StandingMotion, center_of_pressure
 from models.robot.dynamics import Wrench
 from models.robot.kinematics import joint_limit_index
 from models.robot.robot import Robot
@@ -78,7 +79,7 @@ class StandingSetup:
     Attributes:
         start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
         end: Joint positions at the end, nan where free; all are free if None. Shape (n,), rad or m.
-        external: External wrenches as a function of time and tip position, for example `tip_spring`.
+        wrenches: External wrenches: a list, or a function of time and tip position, for example `tip_spring`.
         control: "acceleration" or "jerk".
         along: Argument of the tasks: "time", or "parameter" from 0 to 1 with velocities per unit of it. A free final
             time needs "parameter", or tasks that suit any horizon.
@@ -86,13 +87,13 @@ class StandingSetup:
             velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone can close a
             gap at the start.
         clearance_constraints: Collision avoidance; None for none.
-        symbols: casadi.SX, or casadi.MX if a task, `external` or a reference calls an interpolant.
+        symbols: casadi.SX, or casadi.MX if a task, `wrenches` or a reference calls an interpolant.
     """
 
     start_velocity: Literal["rest", "free"] = "rest"
     end_velocity: Literal["rest", "free"] = "rest"
     end: Any = None
-    external: External | None = None
+    wrenches: Wrenches = ()
     control: Literal["acceleration", "jerk"] = "acceleration"
     along: Literal["time", "parameter"] = "time"
     tip_level: Literal["position", "acceleration"] = "position"
@@ -173,7 +174,7 @@ def standing_problem(
         words = "limits: standing plans have no limit of power; limit the torques"
         raise ProblemError(words, name="power", value=limits.power)
     setup = StandingSetup() if setup is None else require.instance("standing_problem: setup", setup, StandingSetup)
-    tip_level, along_parameter, external = setup.tip_level, setup.along == "parameter", setup.external
+    tip_level, along_parameter = setup.tip_level, setup.along == "parameter"
     if tip_level == "acceleration" and setup.control == "jerk":
         message = "tip_level 'acceleration' goes with control 'acceleration', not with 'jerk'"
         raise ProblemError(message, name="control", value=setup.control, limit="acceleration")
@@ -195,13 +196,12 @@ def standing_problem(
     if not along_parameter:
         check_rest(equations, 0.0 if rests[0] else None, last if rests[1] else None)
     if rests[0]:
-        tip = np.array(ca.DM(machine.tip_pose((), begin).position))
-        acting = wrenches_at(external, ca.DM(0.0), ca.DM(tip))
+        acting = wrenches_at(setup.wrenches, machine, (), ca.DM(begin), time=ca.DM(0.0))
         # with tip_level "position" the tip is on its path at the nodes alone
         demand = task_demand(equations, begin, along_parameter) if tip_level == "acceleration" else None
         least_force = limits.least_force(machine)
         check_loads(machine, begin, acting, zmp=zmp, least_force=least_force, bounds=bounds, demand=demand)
-    guess = local_guess(machine, equations, duration, begin, by_parameter=along_parameter, external=external)
+    guess = local_guess(machine, equations, duration, begin, by_parameter=along_parameter, wrenches=setup.wrenches)
 
     problem = Problem("standing plan", symbols=setup.symbols)
     final = declare_horizon(problem, horizon)
@@ -219,7 +219,7 @@ def standing_problem(
         progress = _declare_progress(problem, rests, guess)
     none = ca.DM(0, 1)
     constrain_tips(problem, equations, (none, *motion), progress, moving=not rests[0], level=tip_level)
-    wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
+    wrenches = wrenches_at(setup.wrenches, machine, (), joints, time=problem.time)
     _constrain_ground(problem, machine, motion, wrenches, zmp, limits)
     limit_torques(problem, machine.robot, machine.joint_torques(*motion, wrenches), bounds.torque)
 

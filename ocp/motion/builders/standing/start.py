@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from models.checks import Array
-from models.machines.machine import Machine
-from models.machines.standing import External, Standing
+from models.machines.machine import Machine, Wrenches
+from models.machines.standing import Standing
 from models.paths import rest_to_rest
 from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
@@ -179,7 +179,7 @@ def local_guess(
     joints: Array,
     *,
     by_parameter: bool,
-    external: External | None,
+    wrenches: Wrenches,
 ) -> dict[str, Any]:
     """Return guesses of states and controls, by name, from a resolved-acceleration motion along the tasks.
 
@@ -193,7 +193,7 @@ def local_guess(
     options = AccelerationOptions(null_damping=STARTS.damping, stop_at_lift_off=False, speed_limit=STARTS.largest_speed)
     try:
         local = resolve_accelerations(
-            machine, tasks, horizon, start=joints, external=external, step=horizon / STARTS.steps, options=options
+            machine, tasks, horizon, start=joints, wrenches=wrenches, step=horizon / STARTS.steps, options=options
         ).motion
     except ProblemError:  # task and start were checked: the start is singular, and a plan may still leave it
         pass

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 
 from models import Standing
-from models.machines.standing import External, StandingMotion
+from models.machines.machine import Wrenches
+from models.machines.standing import StandingMotion
 from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array
 
@@ -20,7 +21,7 @@ CONTACT = 'friction="2 0.01 0.001" solref="0.004 1" solimp="0.99 0.999 0.0001" c
 
 
 def replay(
-    machine: Standing, motion: StandingMotion, fallen: float = 0.3, external: External | None = None
+    machine: Standing, motion: StandingMotion, fallen: float = 0.3, wrenches: Wrenches = ()
 ) -> tuple[Array, Array]:
     """Times (K,) and tilts of the foot (K,), rad, until the end or until the foot is tilted by `fallen`.
 
@@ -61,7 +62,7 @@ def replay(
         joints, velocities, torques = (values[k] for values in planned)
         data.qfrc_applied[:] = 0.0
         data.qfrc_applied[6:] = torques + stiffness * (joints - data.qpos[7:]) + stiffness / 20 * velocities
-        for wrench in external(times[k], tips[k]) if external is not None else ():
+        for wrench in wrenches(times[k], tips[k]) if callable(wrenches) else wrenches:
             body = model.body(wrench.link).id
             mujoco.mj_kinematics(model, data)
             point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ np.array(wrench.point).ravel()
@@ -76,16 +77,16 @@ def replay(
     return times, tilts
 
 
-def assert_stands(machine: Standing, motion: StandingMotion, external: External | None = None) -> None:
+def assert_stands(machine: Standing, motion: StandingMotion, wrenches: Wrenches = ()) -> None:
     """The foot stays flat on the floor to the end."""
-    times, tilts = replay(machine, motion, external=external)
+    times, tilts = replay(machine, motion, wrenches=wrenches)
     assert times[-1] > 0.985 * motion.t[-1]
     assert tilts.max() < 1e-3
 
 
-def assert_tips(machine: Standing, motion: StandingMotion, tilt: float, external: External | None = None) -> float:
+def assert_tips(machine: Standing, motion: StandingMotion, tilt: float, wrenches: Wrenches = ()) -> float:
     """The foot tips by more than `tilt`, still falling, but not before the zero moment point leaves it; how long."""
-    times, tilts = replay(machine, motion, external=external)
+    times, tilts = replay(machine, motion, wrenches=wrenches)
     assert tilts[-1] == tilts.max() > tilt
     assert tilts[times < motion.t[motion.foot_margin < 0][0]].max() < 2e-3
     return float(times[-1])

@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 
 from models import STANDING_STARTS, Standing, Wrench, standing_example
-from models.machines.machine import with_tip
-from models.machines.standing import External, StandingMotion, standing_motion, tip_spring
+from models.machines.machine import Wrenches, with_tip
+from models.machines.standing import StandingMotion, standing_motion, tip_spring
 from models.paths import rest_to_rest
 from ocp import Problem, Solution, TipTask
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
@@ -57,7 +57,7 @@ def table_task(table: int) -> TipTask:
     return led(lambda t: [y + 0.2 * (1 - ca.cos(t)), z])
 
 
-def spring() -> External:
+def spring() -> Wrenches:
     """k = 150 N/m along y, relaxed where the tip of Table 2 starts."""
     return tip_spring(machine(), (0, 150, 0), tip_at(machine(), STANDING_STARTS[2]))
 
@@ -71,7 +71,7 @@ def with_setup(options: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def table_plan(table: int, zmp: Any, **changes: Any) -> Problem:
-    settings = with_setup({"external": spring() if table == 2 else None, **changes})
+    settings = with_setup({"wrenches": spring() if table == 2 else (), **changes})
     settings = {"zmp": zmp, "limits": LIMITS, "start": STANDING_STARTS[table], **settings}
     return standing_problem(machine(), table_task(table), HORIZON, **settings)
 
@@ -159,7 +159,7 @@ def two_tasks(left: Any, right: Any) -> list[TipTask]:
 
 
 def sampled(
-    standing: Standing, solution: Solution, external: External | None = None, rows: Any = ROWS, finer: int = 10
+    standing: Standing, solution: Solution, wrenches: Wrenches = (), rows: Any = ROWS, finer: int = 10
 ) -> StandingMotion:
     """A plan on a grid `finer` times its own, at the middles of the parts, where held controls are plain."""
     count = solution.method["intervals"] * finer
@@ -171,7 +171,7 @@ def sampled(
         values["joints"],
         values["velocities"],
         joint_accelerations=values["accelerations"],
-        external=external,
+        wrenches=wrenches,
         rows=rows,
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio
 import pytest
 
-from models import FixedBase, FreeFloating, Joint, Link, Robot, planar_chain, with_load
+from models import FixedBase, FreeFloating, Joint, Link, Robot, Wrench, planar_chain, with_load
 from ocp import (
     Collocation,
     Cost,
@@ -169,6 +169,30 @@ def test_jerks_that_are_limited_make_a_mass_start_softly() -> None:
 
 
 # ---- laws ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_least_effort_against_a_force_that_varies_is_a_line_in_time() -> None:
+    """m q'' = u + F(t) with the least integral of u^2: u = a + b t, by the two ends at rest. A constant is a list."""
+    horizon, size = 2.0, 5.0
+    t, weights = np.polynomial.legendre.leggauss(20)
+    t, weights = horizon * (t + 1) / 2, horizon * weights / 2
+
+    def wave(time: Any) -> Any:
+        return size * ca.sin(3 * time)
+
+    def varying(time: Any, tip: Any) -> list[Wrench]:
+        return [Wrench("carriage", (wave(time), 0.0, 0.0))]
+
+    for wrenches, force in ((varying, np.array(wave(ca.DM(t))).ravel()), ([Wrench("carriage", (size, 0, 0))], size)):
+        setup = DynamicsSetup(wrenches=wrenches)
+        effort = Cost(velocity=0.0, effort=1.0)
+        problem = dynamics_problem(slider(), (), horizon, start=[0.0], end=[DISPLACEMENT], cost=effort, setup=setup)
+        result = solve(problem, Collocation(12, 4))
+        rows = np.array([[weights.sum(), weights @ t], [weights @ (horizon - t), weights @ ((horizon - t) * t)]])
+        right = [-weights @ (force * np.ones(20)), MASS * DISPLACEMENT - weights @ ((horizon - t) * force)]
+        line = np.linalg.solve(rows, right)
+        assert result.cost == pytest.approx(weights @ (line[0] + line[1] * t) ** 2, rel=1e-6)
+        assert result.audit().passed
 
 
 def test_energy_of_actuators_is_kinetic_or_lost_in_friction() -> None:

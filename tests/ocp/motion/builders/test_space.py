@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from models import FreeFloating, Link, Robot, Wrench, find_wheels, mass_matrix, planar_chain, with_wheels
+from models import FreeFloating, Joint, Link, Robot, Wrench, find_wheels, mass_matrix, planar_chain, with_wheels
 from models.paths.splines import exponential
 from ocp import (
     Collocation,
@@ -17,6 +17,7 @@ from ocp import (
     DynamicsSetup,
     ProblemError,
     Solution,
+    SolveError,
     TipTask,
     dynamics_problem,
     joint_torques,
@@ -24,6 +25,7 @@ from ocp import (
     solve,
 )
 from ocp import plan as plan_motion
+from ocp.motion.local.rates import tracking_weights
 from scripts.robots.simulation import mujoco_model
 from tests.models.machines.test_actuators import satellite, state, wheeled
 from tests.models.robot.trees import Array
@@ -172,22 +174,51 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
     assert held.audit().feasible
 
 
-@pytest.mark.long
-def test_wheels_hold_the_attitude_of_a_published_space_arm_while_its_tip_moves() -> None:
-    """A start and the tip's path are given; of the ten joints four are redundant."""
-    robot = with_wheels(floating_manipulator().robot, np.eye(3), 0.05, momentum=40.0, torque=1.0, mass=2.0)
+def held_arm(inertia: float) -> tuple[FreeFloating, Array, list[TipTask], Array]:
+    """The published arm with wheels of an inertia, kg m^2: start, tip task of 20 s with a fixed attitude, and goal."""
+    options: dict[str, Any] = {"momentum": 800 * inertia, "torque": 1.0, "mass": 2.0}
+    robot = with_wheels(floating_manipulator().robot, np.eye(3), inertia, **options)
     machine, start = FreeFloating(robot), np.array([0.3, -0.5, 0.4, 0.9, 0.2, 0.7, 0.1, *[0.0] * 3])
     shift = np.array([-0.15, 0.2, 0.1])
     place = np.array(ca.DM(machine.tip_pose(machine.base_home(), start).position)).ravel()
     tool = TipTask(position=along(place, shift), duration=20.0)
     hold = TipTask(link=robot.root, orientation=np.eye(3), duration=20.0)
-    weights = [1.0] * 7 + [1e-7] * 3  # a wheel turns by hundreds of rad
-    result = plan_motion(machine, [tool, hold], start=start, cost=Cost(weights=weights))
+    return machine, start, [tool, hold], place + shift
+
+
+@pytest.mark.parametrize(
+    ("inertia", "weight"),
+    [
+        pytest.param(0.05, 1e-7, marks=pytest.mark.long),  # a wheel turns by hundreds of rad
+        pytest.param(0.05, 1e-4, marks=pytest.mark.long),  # such wheels cost more than the arm, which avoids them
+        (0.2, 1e-4),
+    ],
+)
+def test_wheels_hold_the_attitude_of_a_published_space_arm_while_its_tip_moves(inertia: float, weight: float) -> None:
+    """A start and the tip's path are given; of the ten joints four are redundant."""
+    machine, start, tasks, goal = held_arm(inertia)
+    result = plan_motion(machine, tasks, start=start, cost=Cost(weights=[1.0] * 7 + [weight] * 3))
     assert result.audit().passed
     assert turned_in_mujoco(machine, result, "rates") < 1e-6
     assert turned_in_mujoco(machine, result, "rates", wheels=0.99) > 1e-6  # the check notices one per cent
     end = machine.tip_pose(result.at(20.0)["base"], result.at(20.0)["joints"])
-    np.testing.assert_allclose(np.array(ca.DM(end.position)).ravel(), place + shift, atol=1e-6)
+    np.testing.assert_allclose(np.array(ca.DM(end.position)).ravel(), goal, atol=1e-6)
+
+
+def test_too_costly_wheels_are_named_with_weights_at_which_they_cost_as_much_as_the_arm() -> None:
+    """A wheel of inertia J at 1 rad/s turns a machine of inertia I by J / I about its axis: momentum is conserved."""
+    rod = Link("rod", 1e-9, (0, 0, 0), 1e-9 * np.eye(3))
+    links = Link("hub", 60.0, (0, 0, 0), np.diag([10.0, 12.0, 16.0])), rod
+    body = Robot(links, (Joint("shoulder", "revolute", "hub", "rod"),))
+    machine = FreeFloating(with_wheels(body, np.eye(3), 0.02))
+    requested = np.array([2.0, 1.0, 1.0, 1e-9])
+    weights, light = tracking_weights(machine, machine.base_home(), np.zeros(4), requested)
+    np.testing.assert_array_equal(weights, requested)
+    inertias = np.array([10.0, 12.0]) + 0.02 + 2 * 0.6 * 0.02  # a disc: 0.6 of its axial inertia
+    np.testing.assert_allclose(light, [2.0, *2.0 * (0.02 / inertias) ** 2, 1e-9], rtol=1e-6)
+    costly, start, tasks, _ = held_arm(0.01)
+    with pytest.raises(SolveError, match=r"time limit.*lower weights of the reaction wheels.*'wheel3'"):
+        plan_motion(costly, tasks, start=start, time_limit=1.0)
 
 
 def test_turning_that_costs_is_less() -> None:

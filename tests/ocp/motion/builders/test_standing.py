@@ -269,17 +269,17 @@ def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
 
 
 @pytest.mark.parametrize(
-    ("standing", "task", "start", "external", "index"),
+    ("standing", "task", "start", "wrenches", "index"),
     [
         pytest.param(arm(), arm_task(), ARM_START, tool, -0.3, marks=pytest.mark.long, id="seven joints"),
         pytest.param(six(), six_task(), SIX_START, six_tool, -0.01, id="six joints"),
     ],
 )
 def test_a_spatial_arm_stands_where_the_local_method_tips(
-    standing: Standing, task: TipTask, start: Any, external: Any, index: float
+    standing: Standing, task: TipTask, start: Any, wrenches: Any, index: float
 ) -> None:
     horizon = ARM_HORIZON if standing is arm() else 1.0
-    local = resolve_accelerations(standing, task, horizon, start=start, external=external, step=2e-3).motion
+    local = resolve_accelerations(standing, task, horizon, start=start, wrenches=wrenches, step=2e-3).motion
     assert not local.stands
     assert local.index.min() < index
     limits = Limits(friction=0.7, acceleration=100.0)
@@ -290,10 +290,10 @@ def test_a_spatial_arm_stands_where_the_local_method_tips(
         horizon,
         start=start,
         **settings,
-        setup=StandingSetup(tip_level="acceleration", external=external),
+        setup=StandingSetup(tip_level="acceleration", wrenches=wrenches),
     )
     assert problem.declared.path["zero moment point"].size == 4  # both coordinates
-    motion = sampled(standing, points(problem, 12), external, (3, 4, 5))
+    motion = sampled(standing, points(problem, 12), wrenches, (3, 4, 5))
     assert motion.stands
     assert motion.index.min() >= 0
     assert motion.stays_in_limits
@@ -301,18 +301,18 @@ def test_a_spatial_arm_stands_where_the_local_method_tips(
     assert np.abs(motion.joint_torques).max() <= 300
     assert tip_error(standing, motion, task) < 1e-5
     if standing is arm():
-        assert_stands(standing, motion, external)
-        assert_tips(standing, local, 0.05, external)
+        assert_stands(standing, motion, wrenches)
+        assert_tips(standing, local, 0.05, wrenches)
 
 
-def excess(standing: Standing, solution: Solution, limits: Limits, external: Any = None) -> dict[str, float]:
+def excess(standing: Standing, solution: Solution, limits: Limits, wrenches: Any = ()) -> dict[str, float]:
     """By how much what is limited is exceeded on ten times the grid, the ends of the intervals included."""
     count = solution.method["intervals"]
     inside = np.clip(np.linspace(0.0, 1.0, 11), 1e-9, 1 - 1e-9)  # from within: controls jump at the ends
     at = ((np.arange(count)[:, None] + inside) / count).ravel()
     values = solution.at_fraction(at)
     q, qd, qdd = (values[name] for name in ("joints", "velocities", "accelerations"))
-    motion = standing_motion(standing, at * solution.horizon, q, qd, joint_accelerations=qdd, external=external)
+    motion = standing_motion(standing, at * solution.horizon, q, qd, joint_accelerations=qdd, wrenches=wrenches)
     bounds = limits.bounds(standing)
     sizes = (motion.joint_velocities, motion.joint_accelerations, motion.joint_torques)
     most = {"velocity": bounds.velocity, "acceleration": bounds.acceleration, "torque": bounds.torque}
@@ -473,7 +473,7 @@ def test_a_standing_machine_yields_to_a_time_dependent_force() -> None:
     def push(t: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 30 * ca.sin(t), -20))]
 
-    solution = held(table_plan(1, IN_RANGE, external=push), 40)
+    solution = held(table_plan(1, IN_RANGE, wrenches=push), 40)
     motion = sampled(machine(), solution, push)
     np.testing.assert_allclose(motion.external_force[:, 1], 30 * np.sin(motion.t), atol=1e-9)
     assert motion.stands

@@ -113,13 +113,13 @@ def test_lateral_forces_on_a_planar_machine_count(zmp: ZmpRule) -> None:
     point = resting_point(machine)
     rule = Pinned(point) if isinstance(zmp, Pinned) else zmp
     limits = Limits(acceleration=8.0)
-    solution = planned(machine, TASK, rule, external=push(20.0), limits=limits)
+    solution = planned(machine, TASK, rule, wrenches=push(20.0), limits=limits)
     motion = sampled(machine, solution, push(20.0))
     aside = 20.0 * motion.tip_in_world[:, 2] / motion.ground_force[:, 2]
     np.testing.assert_allclose(motion.zero_moment_point[:, 0], aside, atol=1e-12)
     assert motion.foot_margin.min() > -1e-3
     with pytest.raises(ProblemError, match="zero moment point"):
-        planned(machine, TASK, rule, external=push(60.0), limits=limits)
+        planned(machine, TASK, rule, wrenches=push(60.0), limits=limits)
     standing_problem(
         machine,
         TASK,
@@ -127,7 +127,7 @@ def test_lateral_forces_on_a_planar_machine_count(zmp: ZmpRule) -> None:
         start=START,
         zmp=Anywhere(),
         limits=limits,
-        setup=StandingSetup(external=push(60.0)),
+        setup=StandingSetup(wrenches=push(60.0)),
     )
 
 

@@ -118,10 +118,10 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     turn, _ = pose(arm(), (), ARM_START)
     turning = {kind: turn if kind == "orientation" else turn[:, 2]}
     task = moved_task(arm(), ARM_START, ASIDE, SWING, **turning)
-    local = resolve_accelerations(arm(), task, SWING, start=ARM_START, step=5e-3, external=tool).motion
+    local = resolve_accelerations(arm(), task, SWING, start=ARM_START, step=5e-3, wrenches=tool).motion
     assert not local.stands
     solution = solve_standing(
-        arm(), task, SWING, start=ARM_START, limits=Limits(zmp=InFoot(0.005)), setup=StandingSetup(external=tool)
+        arm(), task, SWING, start=ARM_START, limits=Limits(zmp=InFoot(0.005)), setup=StandingSetup(wrenches=tool)
     )
     assert solution.audit().passed
     motion = sampled(arm(), solution, tool)

@@ -81,9 +81,9 @@ class Peered:
         return result[peer.columns][names], np.concatenate([moment + np.cross(self.machine.translation, push), push])
 
 
-def assert_pinocchio_agrees(peered: Peered, motion: StandingMotion, external: Any) -> None:
+def assert_pinocchio_agrees(peered: Peered, motion: StandingMotion, wrenches: Any) -> None:
     for k in np.linspace(0, len(motion.t) - 1, 7).astype(int):
-        (wrench,) = external(ca.DM(motion.t[k]), ca.DM(motion.tip_in_world[k]))
+        (wrench,) = wrenches(ca.DM(motion.t[k]), ca.DM(motion.tip_in_world[k]))
         torques, reaction = peered.needed(motion, k, wrench)
         scale = np.abs(torques).max()
         np.testing.assert_allclose(motion.joint_torques[k], torques, rtol=0, atol=RELATIVE * scale)
@@ -132,7 +132,7 @@ def test_tiago_stands_where_instantaneous_resolution_tips_it(tiago: gallery.Resu
 def test_pinning_the_zero_moment_point_where_it_starts_makes_tiago_lift_off(tiago: gallery.Results) -> None:
     place = tiago.local.zero_moment_point[0]
     task = gallery.from_rest(gallery.circle(tiago.machine))
-    settings: dict[str, Any] = {"law": "augmented", "external": tiago.external, "step": 5e-3}
+    settings: dict[str, Any] = {"law": "augmented", "wrenches": tiago.wrenches, "step": 5e-3}
     settings["options"] = AccelerationOptions(zmp=place)
     result = resolve_accelerations(tiago.machine, task, gallery.SECONDS, start=gallery.START, **settings)
     assert result.stopped is not None
@@ -141,13 +141,13 @@ def test_pinning_the_zero_moment_point_where_it_starts_makes_tiago_lift_off(tiag
 
 def test_pinocchio_finds_the_loads_of_the_plan_of_tiago(tiago: gallery.Results) -> None:
     peered = Peered(tiago.file, tiago.machine, {}, gallery.LOAD)
-    assert_pinocchio_agrees(peered, tiago.motion, tiago.external)
+    assert_pinocchio_agrees(peered, tiago.motion, tiago.wrenches)
 
 
 def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None:
     solution = solve(gallery.problem(tiago.machine, along="parameter"), gallery.METHOD)
     assert solution.cost < tiago.solution.cost
-    motion = gallery.sampled(tiago.machine, solution, tiago.external)
+    motion = gallery.sampled(tiago.machine, solution, tiago.wrenches)
     assert motion.stands
     assert_in_limits(tiago.robot, motion)
     audit = solution.audit(tolerances=gallery.TOLERANCES)
@@ -159,7 +159,7 @@ def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None
 
 def test_anymal_stands_where_instantaneous_resolution_tips_it(anymal: Peered, anymal_solution: Solution) -> None:
     machine = anymal.machine
-    settings: dict[str, Any] = {"external": pushing.reaction(machine), "step": 1e-2}
+    settings: dict[str, Any] = {"wrenches": pushing.reaction(machine), "step": 1e-2}
     task = pushing.task(machine)
     local = resolve_accelerations(machine, task, pushing.SECONDS, start=pushing.START, **settings).motion
     assert not local.stands

@@ -41,9 +41,9 @@ from tests.ocp.motion.tasks.space_tasks import pose, turned
 
 
 def table(number: int, **settings: Any) -> AccelerationSolution:
-    external = spring() if number == 2 else None
+    wrenches = spring() if number == 2 else ()
     start = STANDING_STARTS[number]
-    return resolve_accelerations(machine(), table_task(number), HORIZON, start=start, external=external, **settings)
+    return resolve_accelerations(machine(), table_task(number), HORIZON, start=start, wrenches=wrenches, **settings)
 
 
 def law(standing: Standing, task: TipTask, **settings: Any) -> Any:
@@ -100,7 +100,7 @@ def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
     for what in ("joints", "joint_velocities", "joint_accelerations"):
         matches = [getattr(solution.motion, what) for solution in both]
         np.testing.assert_allclose(matches[0], matches[1], rtol=0, atol=1e-9)
-    laws = [law(arm(), arm_task(), external=tool, law=name) for name in ("augmented", "null_space")]
+    laws = [law(arm(), arm_task(), wrenches=tool, law=name) for name in ("augmented", "null_space")]
     rng = np.random.default_rng(1)
     for _ in range(5):
         at = near(rng, ARM_START)
@@ -110,7 +110,7 @@ def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
 def test_the_augmented_law_is_the_least_acceleration_that_does_both() -> None:
     """(20) by numpy's pseudo-inverse of the stacked rows, on a spatial arm with a wrench at the tool."""
     standing, rng = arm(), np.random.default_rng(2)
-    result = law(standing, arm_task(), external=tool, law="augmented")
+    result = law(standing, arm_task(), wrenches=tool, law="augmented")
     n = standing.joint_size
     q, qd, t = ca.SX.sym("q", n), ca.SX.sym("qd", n), ca.SX.sym("t")
     jacobian = standing.tip_jacobian((), q)[3:6, :]
@@ -192,7 +192,7 @@ def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
         if values[-1] < 1e-2 * values[0]:
             continue
         tried += 1
-        outside = {"external": lambda t, tip: [standing.tip_wrench(ca.DM(push) * (1 + t) - tip)]}  # noqa: B023
+        outside = {"wrenches": lambda t, tip: [standing.tip_wrench(ca.DM(push) * (1 + t) - tip)]}  # noqa: B023
         start = standing.tip_pose((), q0).position[1:3]
         matches = [
             numeric(law(standing, led(lambda t: start + ca.sin(3 * t)), law=name, **outside)(0.3, q0, qd0))  # noqa: B023
@@ -386,7 +386,7 @@ def test_the_integration_is_of_fourth_order_toward_the_solution_of_scipy() -> No
 
 
 def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
-    result = resolve_accelerations(arm(), arm_task(), ARM_HORIZON, start=ARM_START, external=tool, step=2e-3)
+    result = resolve_accelerations(arm(), arm_task(), ARM_HORIZON, start=ARM_START, wrenches=tool, step=2e-3)
     assert result.stopped is None
     assert result.tip_error.max() < 1e-9
     assert result.motion.index.min() < -0.3
@@ -460,23 +460,23 @@ def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("external", "message"),
+    ("wrenches", "message"),
     [
-        (3, "external must be a function"),
+        (3, "wrenches must be a list"),
         (lambda time, tip: None, "wrenches must be a list"),
         (lambda time, tip: machine().tip_wrench((0, 0, 1)), "wrenches must be a list"),
     ],
 )
-def test_functions_without_wrenches_are_refused(external: Any, message: str) -> None:
+def test_functions_without_wrenches_are_refused(wrenches: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        resolve_accelerations(machine(), table_task(1), 1.0, start=STANDING_STARTS[1], external=external)
+        resolve_accelerations(machine(), table_task(1), 1.0, start=STANDING_STARTS[1], wrenches=wrenches)
 
 
 def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
     def push(time: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
 
-    result = resolve_accelerations(machine(), table_task(1), 0.3, start=STANDING_STARTS[1], external=push, step=0.01)
+    result = resolve_accelerations(machine(), table_task(1), 0.3, start=STANDING_STARTS[1], wrenches=push, step=0.01)
     assert result.stopped is not None
     assert result.stopped.reason == "breakdown"
     assert result.stopped.time == pytest.approx(0.11)

@@ -26,7 +26,8 @@ from models import (
     with_load,
 )
 from models.checks import Array
-from models.machines.standing import center_of_pressure, wrenches_at
+from models.machines.machine import wrenches_at
+from models.machines.standing import center_of_pressure
 from models.spatial import quaternion_from_rotation
 from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, SolveError, Waypoints, joint_torques, plan, plan_problem
 from ocp.__main__ import main
@@ -84,7 +85,7 @@ def loads(result: Plan, payload: float, samples: int) -> tuple[Array, Array]:
     bases = result.at(sample.t)["base"] if machine.base_size else np.zeros((samples, 0))
     inside: Any = ca.SX(0, 1)
     if isinstance(machine, Standing):
-        wrenches = wrenches_at(getattr(setup, "external", None), time, machine.tip_pose((), q).position)
+        wrenches = wrenches_at(getattr(setup, "wrenches", ()), machine, (), q, time=time)
         torques = machine.joint_torques(q, v, a, wrenches)
         inside = machine.support.margin(center_of_pressure(machine.ground_reaction(q, v, a, wrenches)))
     else:
