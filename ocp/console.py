@@ -69,7 +69,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Ask the call that this thread runs to end (``stop``); raise KeyboardInterrupt in it if it does not."""
+        """Ask the call in this thread to end, by setting ``stop``; raise KeyboardInterrupt in it if it does not."""
         self.stop = True
         began = time.monotonic()
         try:

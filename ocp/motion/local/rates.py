@@ -336,7 +336,7 @@ class LocalMotion:
 
 
 def tracking_weights(machine: Machine, base: Array, joints: Array, weights: Array) -> list[Array]:
-    """Return the weights of the joint rates, shape (n,), with which a local motion is tried, one after the other.
+    """Return the weights of joint rates, one or two vectors of shape (n,), that a local motion tries in turn.
 
     They are the given weights and, if these make reaction wheels costly, smaller weights of the wheels. With costly
     wheels a local motion lets the arm hold the attitude of its base, which often ends at a singularity. With the

@@ -103,7 +103,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Sum of the lower bounds of the consecutive plans, each for its fixed ends; None if a bound is unknown."""
+        """Sum of the lower bounds of the consecutive plans' costs, each with its ends fixed; None if one is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 

@@ -97,7 +97,7 @@ class StepBounds(Protocol):
 
     @property
     def curve(self) -> Array:
-        """Symmetric matrices of the quadratic terms of the lower bounds. Shape (P, r, r)."""
+        """Symmetric matrices of the quadratic terms of lower bounds of the cost-to-go. Shape (P, r, r)."""
 
     def select(self, rows: Any) -> Self:
         """Return the lower bounds of the cost-to-go through the steps with the given indices."""

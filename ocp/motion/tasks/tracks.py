@@ -110,7 +110,7 @@ class PathTracks(NamedTuple):
 
 
 def ramp_limits(acceleration: float | None, jerk: float | None) -> tuple[float, float]:
-    """Return acceleration and jerk along a path (m/s^2, m/s^3); None stands for the defaults of `TipTask.along`."""
+    """Return the limits of acceleration, m/s^2, and jerk, m/s^3, along a path; an argument None selects the default."""
     if acceleration is None:
         acceleration = PATH_ACCELERATION
     require.positive("acceleration", acceleration)
