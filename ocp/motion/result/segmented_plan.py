@@ -86,7 +86,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def _plans(self) -> tuple[SolvedPlan, ...]:
-        """Plans of all pieces; their costs and bounds are summed, and their candidates listed together."""
+        """Plans of all pieces, in order of time."""
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------

@@ -446,9 +446,9 @@ def optimise_path(path: Array, problem: PathProblem) -> Array:
 
 
 def optimality_of(path: Array, problem: PathProblem) -> tuple[float, bool]:
-    """Return the cost that small displacements of a path (K, n) save, and whether they may save more to second order.
+    """Return how much cost small displacements of a path (K, n) save to first order, and whether they may save more.
 
-    The displacements are at most `PROGRAM.checked`; the saved cost is a first-order estimate.
+    Second-order terms tell whether they may save more. The displacements are at most `PROGRAM.checked`.
     """
     if not problem.dimension or len(path) < 2:
         return 0.0, False

@@ -171,7 +171,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Track a tip path at constant wheel speeds; return the final pose error, m or rad, and an initial guess."""
+        """Track a tip path while reaction wheels keep their speeds; return the pose error, m or rad, and a guess."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()
