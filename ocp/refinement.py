@@ -160,14 +160,9 @@ def _refine_mesh(
     p = form.parameter_vector(solution.parameters)
     intervals: list[int] = []
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
-    best: dict[str, float] = {}
-    vain: dict[str, int] = {}
-    idle, late, placed = 0, False, np.zeros(0)
+    progress, late, placed = _Progress(settings.nearer), False, np.zeros(0)
     moving = isinstance(method, Collocation) and method.control == "points"
-    driven = {f"bounds of {name}" for name in solution.controls}
-    driven |= {owner for owner, controlled in zip(form.path.owners, form.path.uses_control, strict=True) if controlled}
-    if (form.path.equality & form.path.uses_control).any():  # held controls cannot follow the states
-        driven = set()
+    driven = _limits_of_controls(form, solution)
 
     def assess() -> tuple[list[_Row], list[_Row]]:
         """Record the errors of the last plan. Return all of these errors, and the errors that exceed their limits."""
@@ -179,11 +174,8 @@ def _refine_mesh(
 
     while True:
         rows, beyond = assess()
-        unresolved = {row.name: row.unresolved(np.diff(method.fractions)) for row in beyond}
-        nearer = [name for name, part in unresolved.items() if part < settings.nearer * best.get(name, np.inf)]
-        best |= {name: min(part, best.get(name, np.inf)) for name, part in unresolved.items()}
-        vain = {name: 0 if name in nearer else vain.get(name, 0) + 1 for name in unresolved}
-        idle = min(vain.values(), default=0)
+        progress.record({row.name: row.unresolved(np.diff(method.fractions)) for row in beyond})
+        idle = min(progress.vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
         if at_switches is not None and idle >= settings.patience:  # nodes at switches do not help
             moving, at_switches, idle = False, None, 0
@@ -195,10 +187,12 @@ def _refine_mesh(
             parts = _parts_per_interval(beyond, rows, method.fractions, settings)
             following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
         unchanged = np.array_equal(following.fractions, method.fractions)
-        vainly = max((vain[name] + settings.patience * unchanged for name in driven & vain.keys()), default=0)
-        if isinstance(method, Collocation) and method.control == "points" and vainly >= settings.patience:
+        rounds = [progress.vain[name] + settings.patience * unchanged for name in driven & progress.vain.keys()]
+        vainly = max(rounds, default=0) >= settings.patience
+        if isinstance(method, Collocation) and method.control == "points" and vainly:
             # held over each interval, controls that oscillate on every mesh have no values but those of the solver
-            following, moving, unchanged, vain, best = replace(method, control="held"), False, False, {}, {}
+            following, moving, unchanged = replace(method, control="held"), False, False
+            progress = _Progress(settings.nearer)
         if not beyond or unchanged or len(intervals) == settings.rounds:
             break
         method = following
@@ -214,6 +208,35 @@ def _refine_mesh(
     history = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
     return replace(solution, refinement=refinement), audit
+
+
+@dataclass
+class _Progress:
+    """Progress of the errors that exceed their limits, from mesh to mesh.
+
+    Attributes:
+        nearer: Ratio of an error to its smallest value so far below which a mesh counts as an improvement.
+        best: Smallest value so far of each error, by the name of the row.
+        vain: Number of meshes without an improvement, one after the other, by the name of the row.
+    """
+
+    nearer: float
+    best: dict[str, float] = field(default_factory=dict)
+    vain: dict[str, int] = field(default_factory=dict)
+
+    def record(self, errors: dict[str, float]) -> None:
+        """Take in the errors of the plan on the next mesh, by the name of the row."""
+        improved = {name: error < self.nearer * self.best.get(name, np.inf) for name, error in errors.items()}
+        self.best |= {name: min(error, self.best.get(name, np.inf)) for name, error in errors.items()}
+        self.vain = {name: 0 if improved[name] else self.vain.get(name, 0) + 1 for name in errors}
+
+
+def _limits_of_controls(form: Formulation, solution: Solution) -> set[str]:
+    """Return the names of the rows that limit controls; none if an equality contains controls."""
+    if (form.path.equality & form.path.uses_control).any():  # held controls cannot follow the states
+        return set()
+    owners = {owner for owner, controlled in zip(form.path.owners, form.path.uses_control, strict=True) if controlled}
+    return owners | {f"bounds of {name}" for name in solution.controls}
 
 
 def _shortfall(

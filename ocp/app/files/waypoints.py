@@ -287,6 +287,12 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
                 scale = units[unit_name]
         names.append(name)
         scales.append(scale)
+    _check_complete(file, head, names)
+    return names, scales, tuple(ignored)
+
+
+def _check_complete(file: FileName, head: Sequence[str], names: Sequence[str]) -> None:
+    """Raise ProblemError unless the columns include the position, and all components of every other quantity."""
     for kind in KINDS:
         missing = [name for name in kind if name not in names]
         if missing and (kind == POSITION or len(missing) < len(kind)):
@@ -295,7 +301,6 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
             if head and re.fullmatch(r"[GMNO]\d+.*", head[0]):
                 remedy = "is it G-code? Read it in Python: ocp.app.files.read_gcode"
             raise ProblemError(f"{message}; {remedy}", name=missing[0], value=tuple(head))
-    return names, scales, tuple(ignored)
 
 
 def _quaternions(file: FileName, values: Array, rows: Sequence[TableRow]) -> Array:

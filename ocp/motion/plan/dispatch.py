@@ -196,17 +196,7 @@ def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, optio
     torque = limits.bounds(machine).torque
     reserve = {"distance": sum(size for name, size in sizes.items() if name not in LOADS), "torque": torque}
     if isinstance(scene, Scene) and reserve["distance"]:
-        by = reserve["distance"]
-        single = not isinstance(scene.obstacles, list | tuple)
-        obstacles: Any = (scene.obstacles,) if single else scene.obstacles
-        with problem_errors():
-            enlarged = [
-                replace(each, shape=enlarge_shape(each.shape, by))
-                if isinstance(each, MovingObstacle)
-                else enlarge_shape(checked_shape("scene: obstacle", each), by)
-                for each in obstacles
-            ]
-        scene = replace(scene, obstacles=enlarged)
+        scene = _enlarge_obstacles(scene, reserve["distance"])
     tightened = torque
     for _ in range(MAX_TIGHTENINGS):
         own = limits if tightened is torque else replace(limits, torque=tightened)
@@ -232,6 +222,19 @@ def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, optio
         tightened = np.minimum(tightened, [lower.get(name, np.inf) for name in machine.robot.joint_names])
     words = f"no motion keeps all limits for the stated uncertainties: the best one found {margin.sentence}"
     raise SolveError(words, name=margin.factor.limit, value=margin.factor.size, limit=1.0, time=margin.factor.time)
+
+
+def _enlarge_obstacles(scene: Scene, by: float) -> Scene:
+    """Return a scene whose obstacles contain all points that are at most `by` (m) from the obstacles of this scene."""
+    obstacles: Any = scene.obstacles if isinstance(scene.obstacles, list | tuple) else (scene.obstacles,)
+    with problem_errors():
+        enlarged = [
+            replace(each, shape=enlarge_shape(each.shape, by))
+            if isinstance(each, MovingObstacle)
+            else enlarge_shape(checked_shape("scene: obstacle", each), by)
+            for each in obstacles
+        ]
+    return replace(scene, obstacles=enlarged)
 
 
 def _are_separate(goals: Sequence[Any]) -> bool:
