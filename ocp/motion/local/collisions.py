@@ -192,7 +192,7 @@ def worst_collisions(
 def _collision_at(
     scene: CollisionScene, place: tuple[int, int], distance: float, base: Array, joints: Array, times: Array
 ) -> Collision:
-    """Return the collision of a pair of bodies at a sample; `place` is the index of the sample, then of the pair."""
+    """Return the collision of a pair of bodies at a sample; `place` has the index of the sample and of the pair."""
     at, pair = place
     base, time = np.broadcast_to(base, (len(joints), scene.machine.base_size))[at], float(np.ravel(times)[at])
     covers = pair in scene.cover_pairs

@@ -263,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
+    """Return the largest ratio of each quantity to its limit in given intervals, and those at the enforced points.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 

@@ -51,7 +51,7 @@ class QuadraticBounds(NamedTuple):
         return self.least + least, place
 
     def at(self, places: Array) -> Array:
-        """Return the values (N,) of the lower bounds at chart coordinates (N, r)."""
+        """Return the values (N,) of the lower bounds of the value function at chart coordinates (N, r)."""
         products = np.einsum("nab,nb->na", self.curve, places)
         return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
