@@ -3,14 +3,11 @@
 from importlib.util import find_spec as _find_spec
 from pathlib import Path as _Path
 
-if (
-    _Path(
-        _file := (_spec.origin or [*(_spec.submodule_search_locations or ()), ""][0])
-        if (_spec := _find_spec("models"))
-        else ""
-    ).parent
-    != _Path(__file__).parents[1] / "models"
-):
+if (_spec := _find_spec("models")) is None or [*map(_Path, _spec.submodule_search_locations or ())] != [
+    _Path(__file__).parents[1] / "models"
+]:
+    # a folder without __init__.py has no file of its own
+    _file = (_spec.origin or next(iter(_spec.submodule_search_locations or ()), None)) if _spec else None
     raise ImportError(
         f"`import models` finds {_file or 'no module'}, not the package that selfmotion installs beside {__file__}. "
         "Rename that file or folder, or exclude the folder of the script from the search for modules: "

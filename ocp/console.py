@@ -175,7 +175,13 @@ def time_left() -> float:
 
 
 class TimeLimitReached(Exception):
-    """Error raised when the time limit has passed, which the function that set the limit catches and reports."""
+    """Error raised when the time limit has passed, which the function that set the limit catches and reports.
+
+    Attributes:
+        advice: How the user may reach a result in less time, as the end of a sentence; "" if unknown.
+    """
+
+    advice = ""
 
 
 def check_time() -> None:

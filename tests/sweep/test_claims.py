@@ -156,6 +156,44 @@ def test_the_times_of_schedules_are_those_of_the_last_run() -> None:
     assert page == [median["acceleration", "selfmotion"], median["acceleration", "toppra"]]
     page = claimed("docs/coming_from.md", r"`schedule` takes (\d+) ms in the median and (\d+) ms at most")
     assert page == [median["jerk", "selfmotion"], round(float(rows["jerk", "selfmotion"]["worst_ms"]))]
+    page = claimed("docs/coming_from.md", r"With torque limits, `schedule` takes (\d+) ms for a Panda")
+    assert page == [median["torque", "selfmotion"]]
+
+
+def test_the_figures_beside_toppra_and_copp_are_those_of_the_last_run() -> None:
+    rows = {(row["limits"], row["tool"]): row for row in table("schedules_peers")}
+    own, fine = rows["acceleration", "selfmotion"], rows["acceleration", "copp-py, 4001 points"]
+    coarse = [rows["acceleration", f"{tool}, 1001 points"] for tool in ("toppra", "copp-py")]
+    page = claimed("docs/coming_from.md", r"toppra \(1001 points\), and ([\d.]+) ms and ([\d.]+) ms for copp-py")
+    assert page == [two_digits(float(row["median_ms"])) for row in (coarse[1], fine)]
+    assert float(own["excess_worst"]) < 0.0  # all motions take no longer than those of copp-py on 4001 points
+    page = claimed(
+        "docs/coming_from.md",
+        r"exceed limits by at most ([\d.]+) %. On 1001 points, .*? up to ([\d.]+) % longer .*? by up to ([\d.]+) %\.",
+    )
+    longer, usage = (
+        max(float(row[name]) for row in coarse) for name in ("excess_over_shortest_worst", "largest_usage")
+    )
+    assert page == [
+        round(100 * (float(own["largest_usage"]) - 1), 3),
+        round(100 * longer, 1),
+        round(100 * (usage - 1), 2),
+    ]
+    own, fine = rows["jerk", "selfmotion"], rows["jerk", "copp-py, 4001 points"]
+    graded = rows["jerk", "copp-py, 1001 graded points"]
+    page = claimed(
+        "docs/coming_from.md",
+        r"copp-py takes ([\d.]+) s and fails on (\d+) of the (\d+) paths. On the other (\d+), .*? ([\d.]+) % shorter "
+        r"in the median, and at most ([\d.]+) % longer. .*? takes ([\d.]+) s and finds motions that are up to ([\d.]+) "
+        r"% shorter .*? between its points by up to ([\d.]+) %",
+    )
+    failed, count = int(fine["failed"]), int(own["paths"])
+    excess = [two_digits(100 * float(own[name])) for name in ("excess_median", "excess_worst")]
+    times = [two_digits(float(row["median_ms"]) / 1e3) for row in (fine, graded)]
+    shorter = round(100 * float(own["excess_over_shortest_worst"]), 2)
+    usage = max(float(row["largest_usage"]) for row in (fine, graded))
+    numbers = [times[0], failed, count, count - failed, -excess[0], excess[1], times[1], shorter]
+    assert page == [*numbers, round(100 * (usage - 1), 1)]
 
 
 def test_pages_repeat_the_captions_of_their_figures() -> None:

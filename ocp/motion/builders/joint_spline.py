@@ -151,8 +151,8 @@ def joint_path(machine: Machine, plan: Any, path: PathLike) -> PlannedJoints:
     if isinstance(machine, type) or not (hasattr(machine, "robot") and hasattr(machine, "joint_size")):
         raise ProblemError(f"{machine!r} is no machine with a robot and joints", name="machine", value=machine)
     length = getattr(path, "length", None)
-    if not isinstance(length, float | int) or not length > 0:
-        raise ProblemError(f"the path {path!r} has no length", name="path", value=path)
+    if not isinstance(length, float | int) or not length > 0 or not hasattr(path, "bounds"):
+        raise ProblemError(f"the path {path!r} has no length, or no bounds of segments", name="path", value=path)
     if hasattr(plan, "task_share"):
         plan = _samples_of_plan(plan, path)
     s, joints = _checked_samples(plan, path, machine.joint_size)

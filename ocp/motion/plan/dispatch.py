@@ -133,8 +133,7 @@ def plan(
         except TimeLimitReached as error:
             if time_limit is None:  # that of an outer call
                 raise
-            words = f"no motion was found within the time limit of {time_limit:g} s; raise time_limit"
-            words += "".join(error.args[1:])  # advice of the planner
+            words = f"no motion was found within the time limit of {time_limit:g} s; raise time_limit{error.advice}"
             raise SolveError(words, name="time_limit", limit=time_limit) from error
 
 

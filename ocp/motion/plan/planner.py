@@ -329,7 +329,8 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
     try:
         result, bound = plan_from_configurations(request, configurations, solver)
     except TimeLimitReached as error:
-        raise TimeLimitReached(str(error), _wheel_advice(request, configurations[0])) from error
+        error.advice = _wheel_advice(request, configurations[0])
+        raise
     except (SolveError, Unreachable) as error:
         if isinstance(error, SolveError):
             error.args = (f"{error}{_wheel_advice(request, configurations[0])}",)

@@ -58,7 +58,7 @@ class Reason:
     Attributes:
         kind: Kind of the reason.
         detail: Details in words.
-        remedy: What was tried against it, and with which result.
+        remedy: What was tried against it, with which result; or what the user can change.
         name, value, limit, time: Offending item, its value, its limit and the time, s; None if unknown.
     """
 

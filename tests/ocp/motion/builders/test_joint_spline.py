@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path as File
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -190,6 +191,14 @@ def test_samples_that_are_none_are_named_errors(plan: Any, words: str) -> None:
     with pytest.raises(ProblemError, match=words) as caught:
         joint_path(arm(), plan, PATH)
     assert caught.value.name == "plan"
+
+
+@pytest.mark.parametrize("path", ["path", SimpleNamespace(length=PATH.length), SimpleNamespace(bounds=PATH.bounds)])
+def test_a_path_without_length_or_bounds_is_a_named_error(path: Any) -> None:
+    s = np.linspace(0, PATH.length, 50)
+    with pytest.raises(ProblemError, match="has no length, or no bounds") as caught:
+        joint_path(arm(), (s, angles(s)), path)
+    assert caught.value.name == "path"
 
 
 def test_torques_need_a_fixed_base() -> None:

@@ -18,6 +18,8 @@ from models import FixedBase, Path, SmoothPath, planar_chain, smooth
 from ocp import joint_path
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, ToolLimits, schedule
 from ocp.motion.schedule import grid as grids
+from ocp.motion.schedule.grid import GAUSS
+from ocp.motion.schedule.stretch import HALF_ERROR
 from tests.models.paths.task_paths import seeds
 from tests.ocp.problems import Array
 
@@ -303,3 +305,12 @@ def test_an_axis_moves_no_faster_than_its_limit_and_as_fast_where_that_is_what_l
     motion = timed.at(np.linspace(0.0, timed.duration, 20_001))
     assert motion.speed.max() == pytest.approx(0.5, rel=1e-3)  # along y: 0.3 / 0.6; along x 0.5 / 0.8
     assert motion.speed.max() <= 0.5 * 1.001
+
+
+def test_half_of_a_cubic_is_nearer_to_its_parabola_than_the_whole_by_the_stated_ratio() -> None:
+    """The errors of interpolation of a cubic are multiples of the product of the distances to the nodes."""
+    x = np.linspace(0.0, 0.5, 100_001)
+    half = np.abs(x * (x - GAUSS[0]) * (x - 0.5)).max()
+    whole = np.abs(x * (x - 0.5) * (x - 1.0))
+    assert x[whole.argmax()] == pytest.approx(GAUSS[0], abs=1e-5)
+    assert half / whole.max() == pytest.approx(HALF_ERROR, rel=1e-3)
