@@ -188,8 +188,8 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
     fractions = [(stretch.breaks - stretch.begin) / stretch.duration for stretch in request.stretches]
     rest_rows = _undetermined_rows(request, unlimited, 0), _undetermined_rows(request, unlimited, -1)
-    ramps = _ramps(request, unlimited, limits, rest_rows)
     has_jerks = bool(np.isfinite(limits.bounds(request.machine).jerk).any() or (request.cost and request.cost.jerk))
+    ramps = _ramps(request, unlimited, limits, rest_rows, has_jerks)
     # if the controls are jerks, and the time is fixed, tasks constrain states alone: a stiffly accurate scheme alone
     # damps the errors of such equations, of index 2 (Hairer, Wanner 1996, section VII.4)
     points = replace(POINTS, scheme="radau") if has_jerks and request.time_cost is None else POINTS
@@ -285,16 +285,22 @@ def _slopes(values: Array, times: Array) -> Array:
     return np.asarray(slopes / np.gradient(times, GUESS_PLACES, axis=1)[:, :, None]).reshape(values.shape)
 
 
-def _ramps(request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array]) -> Array:
+def _ramps(
+    request: PlanRequest, unlimited: SolvedPlan, limits: Limits, rest_rows: tuple[Array, Array], has_jerks: bool
+) -> Array:
     """Return the times, as fractions of the horizon, of the middles and ends of the fastest velocity ramps between rest
-    and the self-motion at the ends of a plan. Limited jerks switch at these times.
+    and the self-motion at the ends of a plan. Limited jerks switch at these times. Unlimited accelerations last as long
+    as the smoothing of controls.
     """
     horizon, bounds, shares = request.stretches[-1].end, limits.bounds(request.machine), list[float]()
-    rates = unlimited.sampled(np.array([0.0, unlimited.horizon])).rates
+    rates = unlimited.sampled(np.linspace(0.0, unlimited.horizon, CHECKED_TIMES)).rates
+    rates = rates[:, [name not in unlimited.held for name in unlimited.names]]
     fastest = [np.minimum(most, 1.0 / STANDSTILL).tolist() for most in (bounds.acceleration, bounds.jerk)]
     for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
-        speeds = np.abs(rows.T @ (rows @ rates[k, [name not in unlimited.held for name in unlimited.names]]))
+        speeds = np.abs(rows.T @ (rows @ rates[-k]))
         share = rests * max(map(ramp_time, speeds.tolist(), *fastest)) / horizon
+        if rests and not has_jerks and speeds.max() > LIMIT_SHARE * np.abs(rates).max():
+            share = max(share, Actuation.smoothing)
         if share > RESOLVED_SHARE:
             doublings = max(int(np.log2(1.0 / (POINTS.intervals * share))), 0)
             shares += [abs(k - place) for place in share * 2.0 ** np.arange(-1, doublings + 1) if place < 0.5]

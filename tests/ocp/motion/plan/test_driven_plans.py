@@ -27,6 +27,7 @@ from models.checks import Array
 from ocp import Limits, Plan, SolveError, TipTask, plan
 from ocp.__main__ import main
 from ocp.app.files import read_waypoints
+from ocp.motion.builders.dynamics import Actuation
 from ocp.motion.builders.dynamics_plan import POINTS
 from ocp.motion.plan.actuators import largest_demand
 from ocp.motion.result.solved_plan import SolvedPlan
@@ -63,13 +64,25 @@ def torques_of(result: Plan, times: int = 3001) -> Array:
     return np.asarray(torques_along(result.machine, here))
 
 
-@pytest.mark.parametrize("machine", [FIXED, pytest.param(FLOATING, marks=pytest.mark.long)], ids=["fixed", "floating"])
-def test_active_torque_limits_hold_and_increase_the_cost(machine: Machine, tmp_path: Path) -> None:
-    """Loose ones leave the optimum as it is."""
+@pytest.mark.parametrize(
+    ("machine", "below"),
+    [(FIXED, 1e-4), pytest.param(FLOATING, 1e-2, marks=pytest.mark.long)],
+    ids=["fixed", "floating"],  # largest within the duration of smoothing, where limits are tightened between nodes
+)
+def test_active_torque_limits_hold_and_increase_the_cost(machine: Machine, below: float, tmp_path: Path) -> None:
+    """Loose ones leave the optimum as it is, but for the price of smooth accelerations, known in closed form.
+
+    The least of the integral of (v - w)^2 / 2 + d^2 v'^2 / 2 from v = 0 is d w^2 / 2, for a duration d of smoothing:
+    the self-motion w at the ends of the free plan must start from rest.
+    """
     task = smooth_task(machine)
     free = plan(machine, task, start=START)
     loose = plan(machine, task, start=START, limits=Limits(torque=100.0))
-    assert loose.cost == pytest.approx(free.cost, rel=1e-4)
+    sample, smoothing = free.sampled(np.linspace(0.0, free.horizon, 3001)), Actuation.smoothing * free.horizon
+    squares = np.trapezoid((sample.accelerations**2).sum(axis=1), sample.t)
+    price = smoothing / 2 * (sample.rates[[0, -1]] ** 2).sum() + smoothing**2 / 2 * squares
+    assert loose.cost - free.cost == pytest.approx(price, rel=1e-2)
+    assert loose.cost == pytest.approx(free.cost, rel=LIMIT_SHARE)
     assert np.abs(loose.at(0.7)["joints"] - free.at(0.7)["joints"]).max() < 1e-3
     most = np.abs(torques_of(loose)).max(axis=0) * [0.85, 2.0, 2.0]
     result = plan(machine, task, start=START, limits=Limits(torque=most))
@@ -77,7 +90,7 @@ def test_active_torque_limits_hold_and_increase_the_cost(machine: Machine, tmp_p
     assert "torques" in {finding.name for finding in result.audit().findings}
     assert free.cost * (1 + 1e-5) < result.cost < 1.2 * free.cost
     assert (np.abs(torques_of(result)).max(axis=0) <= most + 1e-5).all()
-    assert np.abs(torques_of(result))[:, 0].max() == pytest.approx(most[0], rel=1e-4)
+    assert np.abs(torques_of(result, 30_001))[:, 0].max() == pytest.approx(most[0], rel=below)
     result.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
     assert again.audit()["torques"].value == result.audit()["torques"].value
