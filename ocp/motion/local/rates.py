@@ -8,9 +8,9 @@ plans.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -208,49 +208,30 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator over one interval between samples; its parameters are start time and duration, s."""
-        span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
-        rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
-        ode, running = rates(span[0] + fraction * span[1], self.state)
-        problem = {"t": fraction, "x": self.state, "p": span, "ode": span[1] * ode, "quad": span[1] * running}
-        return _cvodes(problem, 0.0, np.array([1.0]), tolerance)
-
-
-def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Any:
-    """Return a CVODES integrator of differential equations from the time `start` to given times."""
-    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": start}
-    return integrator("motion", problem, times.tolist(), **options)
-
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
     """Return states and costs at the sample times that an integration reaches, and the reason if it ends early."""
-    try:
-        problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
-        result = _cvodes(problem, times[0], times[1:], tolerance)(x0=first)
-        states = np.vstack([first, np.array(result["xf"]).T])
-        costs = np.concatenate([[0.0], np.array(result["qf"]).ravel()])
-        if np.isfinite(states).all() and np.isfinite(costs).all():
-            return states, costs, None
-    except RuntimeError:
-        pass  # integrate again from sample to sample to find how far it goes
-    step = model.one_interval(tolerance)
-    states_so_far, costs_so_far = [first], [0.0]
-    for begin, end in pairwise(times):
-        try:
-            result = step(x0=states_so_far[-1], p=[begin, end - begin])
-            state, cost = np.array(result["xf"]).ravel(), float(result["qf"])
-            usable = np.isfinite([*state, cost]).all() and np.isfinite(np.array(model.rate(end, state))).all()
-        except RuntimeError:
-            usable = False
-        if not usable:
-            manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
-            reason = f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
-            reason += f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
-            return np.array(states_so_far), np.array(costs_so_far), reason
-        states_so_far.append(state)
-        costs_so_far.append(costs_so_far[-1] + cost)
-    return np.array(states_so_far), np.array(costs_so_far), None
+    problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
+    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": times[0]}
+    run = integrator("motion", problem, times[1:].tolist(), **options)
+    states, costs = np.full((len(times), first.size), np.nan), np.full(len(times), np.nan)
+    states[0], costs[0] = first, 0.0
+    memory, evaluate = run.buffer()  # if the integration fails, the samples before the failure remain
+    memory.set_arg(run.index_in("x0"), first.data)
+    for name, values in (("xf", states), ("qf", costs)):
+        memory.set_res(run.index_out(name), values[1:].data)
+    with contextlib.suppress(RuntimeError):
+        evaluate()
+    rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
+    usable = np.isfinite(np.column_stack([states, costs, rates])).all(axis=1)
+    if usable.all():
+        return states, costs, None
+    count = max(int(usable.argmin()), 1)
+    begin, end = times[count - 1 : count + 1]
+    manipulability = float(_manipulabilities(np.array(model.outputs(begin, states[count - 1])[1])[None])[0])
+    reason = f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
+    reason += f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
+    return states[:count], costs[:count], reason
 
 
 def _report(
