@@ -48,7 +48,7 @@ from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_
 from ocp.motion.local.rates import RateOptions, resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
-from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
@@ -72,7 +72,7 @@ for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan
 __all__ = [
     "AccelerationOptions", "AdaptiveCollocation", "Anywhere", "Audit", "AuditError", "BoundWarning", "Candidate",
     "Capture", "Certificate", "ClearanceConstraints", "Collocation", "Cone", "ControlStep", "Controller", "Cost",
-    "DeadEnd", "DynamicsSetup", "Finding", "Following", "FreeTime", "Goal", "Grasp", "IkConfigurations", "IkOptions",
+    "DeadEnd", "DynamicsSetup", "Finding", "FreeTime", "Goal", "Grasp", "IkConfigurations", "IkOptions",
     "IkSolver", "InFoot", "Incompleteness", "IndexAtLeast", "Indirect", "JointFriction", "Layer", "Limits",
     "MultipleShooting", "Phases", "Pinned", "Plan", "Problem", "ProblemError", "RateOptions", "Reconfiguration",
     "RefinementSettings", "RefinementWarning", "RollObstacles", "RollSettings", "Scene", "Sensitivity", "Solution",
