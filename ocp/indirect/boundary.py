@@ -163,19 +163,11 @@ class BoundaryProblem:
         result = flow_integrator(x0=y, p=q)
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
-    def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and costates at points of a segment, and integrals over it; nan if integration fails.
-
-        Shapes (2 nx, places) and (2,).
-        """
-        states, integrals = evaluate(segment, y, q)
-        return states, integrals.ravel()
-
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """Return states and costates at a position 0..1 of a segment that has the start values ``y``. Shape (2 nx,)."""
         if place == 0.0:
             return y
-        return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
+        return evaluate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
 
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray

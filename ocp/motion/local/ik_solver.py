@@ -23,7 +23,7 @@ from models.machines.machine import with_tip
 from models.spatial import least_rotation, rotation_matrices
 from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
-from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms, is_scara
+from ocp.motion.local.closed_forms import SIX, PoseSolver, closed_forms, is_scara
 from ocp.motion.local.elimination import elimination_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
@@ -352,8 +352,8 @@ def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tu
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
         return (), ()
-    if count == SCARA and (forms := closed_forms(extended)):
-        return forms, ()
+    if is_scara(extended):
+        return closed_forms(extended), ()
     auxiliary = tuple(range(len(extended.axes), len(extended.axes) + SIX - count))
     if auxiliary:
         rng = np.random.default_rng(ARM.seed)

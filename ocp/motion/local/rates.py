@@ -405,19 +405,9 @@ def track_tasks(
             base_now, joints_now = move_base(mean, h), np.clip(joints_now + mean, lower, upper)
             bases.append(base_now)
             configurations.append(joints_now)
-    joint_path = np.stack(configurations, axis=1)
-    rates = np.diff(joint_path, axis=1) / steps[:, None]
+    motions = LocalMotion.through(times, np.stack(bases, axis=1), np.stack(configurations, axis=1), weights)
     errors_along = np.stack(errors, axis=1)
-    worst = errors_along.argmax(axis=1)
-    return LocalMotion(
-        times,
-        np.stack(bases, axis=1),
-        joint_path,
-        np.concatenate([rates, rates[:, -1:]], axis=1),
-        np.asarray(np.einsum("kmn,n,m->k", rates**2, weights, steps) / 2),
-        errors_along.max(axis=1),
-        times[worst],
-    )
+    return replace(motions, pose_error=errors_along.max(axis=1), worst_time=times[errors_along.argmax(axis=1)])
 
 
 def _damped_rates(
