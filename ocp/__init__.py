@@ -43,7 +43,7 @@ from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_co
 from ocp.motion.builders.standing.steps import StepsMotion, StepWeights, resolve_steps, steps_motion, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
-from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
+from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ik_configurations
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.local.rates import RateOptions, resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
@@ -77,7 +77,7 @@ __all__ = [
     "MultipleShooting", "Phases", "Pinned", "Plan", "Problem", "ProblemError", "RateOptions", "Reconfiguration",
     "RefinementSettings", "RefinementWarning", "RollObstacles", "RollSettings", "Scene", "Sensitivity", "Solution",
     "SolveError", "SolverStatus", "Stabiliser", "StancePhase", "StandingSetup", "Start", "StepWeights", "Steps",
-    "StepsMotion", "StorageWarning", "Table", "TipTask", "ToolFreedom", "Unreachable", "VelocitySetup", "Waypoints",
+    "StepsMotion", "StorageWarning", "Table", "TipTask", "Unreachable", "VelocitySetup", "Waypoints",
     "Weights", "capture_problem", "certificate", "chained_capture", "dynamics_phases", "dynamics_problem",
     "ik_configurations", "inverse_kinematics", "joint_path", "joint_torques", "minimum_time_problem",
     "minimum_velocity_problem", "plan", "plan_problem", "prepare", "refine", "resolve", "resolve_accelerations",

@@ -51,7 +51,6 @@ CREATED_BY_THE_PACKAGE = {
     "Frame",
     "IkConfigurations",
     "Incompleteness",
-    "ToolFreedom",
     "JointPath",
     "JointRates",
     "TorqueRates",

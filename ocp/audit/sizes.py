@@ -19,7 +19,7 @@ from ocp.curves import lagrange
 from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
-from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
+from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
 GRID_FACTOR = 10  # refinement of the fine grid over the points of the plan
 COSTS = ("running", "terminal")
@@ -74,14 +74,6 @@ def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     controls = (lagrange(control.nodes, places) @ control.values).reshape(n * m, control.values.shape[2])
     segments, d = max((len(curve.breaks) - 1) // n, 1), len(curve.nodes)
     inside = places + np.where(places > 0, -0.1, 0.1) / (GRID_FACTOR * segments * d)
-    uniform = (mesh[:-1, None] + width[:, None] * (np.arange(segments) / segments)).ravel()
-    is_uniform = len(uniform) == len(curve.breaks) - 1 and np.abs(uniform - curve.breaks[:-1]).max() < MACHINE_SHARE
-    if is_uniform and np.isfinite(curve.values).all():
-        segment = np.clip((inside * segments).astype(int), 0, segments - 1)
-        basis = np.zeros((m, segments, d))
-        basis[np.arange(m), segment] = lagrange(curve.nodes, np.clip(places * segments - segment, 0.0, 1.0))
-        states = basis.reshape(m, -1) @ curve.values.reshape(n, segments * d, -1)
-        return states.reshape(n * m, curve.values.shape[2]), controls, fractions.ravel() * solution.horizon
     inner = mesh[:-1, None] + width[:, None] * inside
     segment = np.clip(np.searchsorted(curve.breaks, inner.ravel(), side="right") - 1, 0, len(curve.breaks) - 2)
     start, end = curve.breaks[segment], curve.breaks[segment + 1]

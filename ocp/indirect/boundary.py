@@ -296,11 +296,7 @@ def newton(
     def residual_at(z: np.ndarray) -> np.ndarray:
         return evaluate(residual, z, data, failed=np.inf)[0].ravel()
 
-    z, value = start, residual_at(start)
-    if value.size != start.size:
-        words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
-        raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
-    polished, stopped = False, None
+    z, value, polished, stopped = start, residual_at(start), False, None
     with stop_requests_polled():
         for steps in range(SETTINGS.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
@@ -314,16 +310,11 @@ def newton(
                 break
             try:
                 with casadi_silenced():
-                    slopes = jacobian(z, data)
-            except RuntimeError:
-                status = SolverStatus.SOLVED if polished else SolverStatus.NOT_FINITE
-                return NewtonResult(z, size, steps, status, "the integration of the sensitivities fails")
-            try:
-                step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
+                    step = np.asarray(ca.solve(jacobian(z, data), ca.DM(-value), "qr").full()).reshape(-1)
             except RuntimeError:
                 step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
-                word = "Newton's matrix is singular: the plan is not unique"
+                word = "Newton's matrix is singular, so that the plan is not unique, or its integration fails"
                 if polished:
                     word = f"Converged in {steps} Newton steps; {word}"
                 status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED

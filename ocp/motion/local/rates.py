@@ -17,14 +17,13 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from models import CollisionScene, FreeFloating, Machine, find_wheels
+from models import FreeFloating, Machine, find_wheels
 from models.checks import Array, real
 from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
 from ocp.errors import ProblemError, require
-from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Start
@@ -48,8 +47,6 @@ class LocalSolution:
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
         tolerance: Absolute and relative tolerance of the integration.
         stopped: Reason why the motion ends before the horizon, None if it does not.
-        clearance: Least distance of two bodies, m, nan without a collision scene. Shape (M,).
-        nearest: Names of these two bodies at each time; empty without a collision scene.
         task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows).
     """
 
@@ -64,8 +61,6 @@ class LocalSolution:
     tolerance: float
     stopped: str | None = None
     task_error: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    clearance: Array = field(default_factory=lambda: np.zeros(0))
-    nearest: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         end = f", stopped: {self.stopped}" if self.stopped else ""
@@ -115,7 +110,6 @@ def resolve(
     *,
     start: Any,
     samples: Any = 501,
-    scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
     """Compute a motion along tasks by resolved-rate control, with the least joint rates at each time.
@@ -130,7 +124,6 @@ def resolve(
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
-        scene: Collision scene of the machine; the distances of its bodies are reported and have no effect.
         options: Weights, damping and tolerance.
 
     Raises:
@@ -149,12 +142,7 @@ def resolve(
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
     model = on_symbols(lambda symbols: _Model(equations, rate_weights, own.damping, symbols))
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
-    solution = _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
-    if scene is None:
-        return solution
-    distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
-    nearest = tuple(scene.labels[k] for k in distances.argmin(axis=1).tolist()) if distances.size else ()
-    return replace(solution, clearance=distances.min(axis=1, initial=np.inf), nearest=nearest)
+    return _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
@@ -253,7 +241,6 @@ def _report(
         tolerance=tolerance,
         stopped=stopped,
         task_error=error.reshape(size, len(times)).T,
-        clearance=np.full(len(times), np.nan),
     )
 
 
