@@ -139,12 +139,9 @@ def evenly_spaced(grid: FineGrid) -> np.ndarray:
 
 
 def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
-    """Replace, in place, sizes that are much smaller than the largest size of the same unit by this largest size.
+    """Replace, in place, sizes (n,) that are at most a share `below` of the largest size of the same unit by this size.
 
-    Args:
-        size: Sizes of all states or controls, changed in place. Shape (n,).
-        places, declared: Indices and declarations of the states or controls, by name.
-        below: Largest share of the largest size of the unit at which a size is replaced.
+    `places` and `declared` are the indices and declarations of the states or controls, by name.
     """
     largest: dict[str, float] = {}
     for name, place in places.items():
@@ -245,13 +242,9 @@ def _sizes_by_unit(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) ->
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the size of each constraint that `Problem.watch` declares, relative to which its error is judged.
+    """Return the size of each watched row: the length of its reference path, or the change `by_variables` without one.
 
-    It is the length of the constraint's reference path or, without one, the change that states and controls cause.
-
-    Args:
-        by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).
-        path_lengths: Path lengths along the grid. Shape (M, rows).
+    Shapes: (rows,) of `by_variables`, and (M, rows) of `path_lengths` along the grid.
     """
     by_variables = np.where(form.watch_integral, horizon, 1.0) * by_variables
     length, size = _spread(path_lengths)[0], by_variables.copy()

@@ -31,15 +31,6 @@ class InFoot:
     def __post_init__(self) -> None:
         require.nonnegative("InFoot: margin", self.margin, unit="m")
 
-    def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon of a machine is too small for the margin that this rule demands."""
-        directions, support = machine.moving_directions, machine.support
-        half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
-        largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
-        if self.margin >= largest * (1 - 1e-9):
-            words = f"InFoot: margin {self.margin!r} m is too large for the support, which allows {largest:g} m at most"
-            raise ProblemError(words, name="margin", value=self.margin, limit=largest)
-
 
 @dataclass(frozen=True)
 class IndexAtLeast:
@@ -54,11 +45,6 @@ class IndexAtLeast:
         if not (np.isfinite(real(self.value)) and self.value < 1):
             words = f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()"
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
-
-    def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return opposite corners (2,), m, of the rectangle of zero moment points with sufficient stability index."""
-        radius = machine.half_widths * np.sqrt(1 - self.value)
-        return machine.most_stable_point - radius, machine.most_stable_point + radius
 
 
 @dataclass(frozen=True)
@@ -112,7 +98,8 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
         return normals, offsets + zmp.margin
     open_edges = np.zeros(len(offsets), dtype=bool)
     if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
+        radius = machine.half_widths * np.sqrt(1 - zmp.value)
+        low, high = machine.most_stable_point - radius, machine.most_stable_point + radius
         corners = np.array(np.meshgrid(*np.transpose([low, high]))).reshape(2, 4)
         open_edges = (normals @ corners).min(axis=1) < offsets
         sides = np.vstack([np.eye(2), -np.eye(2)])
@@ -147,7 +134,12 @@ def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
         words = f"zmp must be InFoot, IndexAtLeast, Pinned or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
     if isinstance(zmp, InFoot):
-        zmp.check(machine)
+        directions, support = machine.moving_directions, machine.support
+        half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
+        largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
+        if zmp.margin >= largest * (1 - 1e-9):
+            words = f"InFoot: margin {zmp.margin!r} m is too large for the support, which allows {largest:g} m at most"
+            raise ProblemError(words, name="margin", value=zmp.margin, limit=largest)
     if not isinstance(zmp, Pinned):
         return
     for time in np.linspace(0.0, horizon, REFERENCE_SAMPLES if callable(zmp.point) else 1):

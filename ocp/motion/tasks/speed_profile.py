@@ -200,9 +200,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
     require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
         require.positive(f"ramp: {name}", value)
-    if change * jerk >= acceleration**2:
-        return change / acceleration + acceleration / jerk
-    return 2 * sqrt(change / jerk)
+    return sum(time for time, _ in ramp_phases(change, acceleration, jerk))
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
