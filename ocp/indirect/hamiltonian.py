@@ -94,12 +94,9 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return multipliers of the path equalities that make the Hamiltonian almost stationary in the free controls.
+        """Return multipliers (K, m) of the path equalities with which H is almost stationary in the ``free`` controls.
 
-        Args:
-            free: Which controls are off their bounds. Shape (K, nu), bool.
-            x, u, lam: States, controls, costates at K samples. Shape (K, .). t: Times, s. Shape (K,).
-            horizon: s. p: Parameters. Shape (np,).
+        ``free`` (K, nu) masks the controls off their bounds at K samples of states, controls and costates.
         """
         form, count = self.form, len(u)
         slope = ca.substitute([ca.gradient(self.value, form.u)], [self.mu], [ca.DM.zeros(len(form.path))])[0]

@@ -139,16 +139,10 @@ class IkSolver:
     """
 
     def __init__(self, machine: Machine, *, limits: bool = True, samples: int = 36) -> None:
-        """Prepare the inverse kinematics of an arm.
+        """Prepare the inverse kinematics of an arm, within its position limits if `limits`.
 
-        Args:
-            machine: Machine on a fixed base.
-            limits: Whether the position limits of the robot apply.
-            samples: Number of samples of the redundant joints, if there are any.
-
-        Raises:
-            ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
-                argument is invalid.
+        Redundant joints are sampled at a number of `samples`. Raises ProblemError if the base moves, no six joints
+        determine the pose of the tip, or an argument is invalid.
         """
         require.instance("machine", machine, FixedBase)
         require.flag("limits", limits)

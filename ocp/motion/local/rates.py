@@ -146,14 +146,10 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the damped least-squares joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v, with
-    the Jacobian G and the weights W of the rates. Shape (n, k).
+    """Return the damped least-squares joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v. Shape (n, k).
 
-    Args:
-        jacobian: Rows of the task, G. Shape (m, n), m <= n.
-        velocity: v, or several as columns. Shape (m, k).
-        damping: In units of the Jacobian.
-        weights: Diagonal of W, weights of the squared joint rates; all 1 if None. Shape (n,).
+    G (m, n), m <= n, is the Jacobian, v (m, k) are task velocities, and W = diag(weights) weighs the squared joint
+    rates, all by 1 if None. The damping is in units of the Jacobian.
     """
     weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
     square = ca.mtimes(jacobian, weighted) + damping**2 * ca.DM.eye(jacobian.shape[0])
@@ -334,11 +330,8 @@ def track_tasks(
 ) -> LocalMotion:
     """Track tasks from several start configurations (K, joint_size) and (K, base_size) by resolved-rate control.
 
-    Args:
-        times: Increasing times, s. Shape (M,).
-        weights: Weights of the squared joint rates. Shape (joint_size,).
-        damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.
-        lower, upper: Limits of the joints. Shape (joint_size,).
+    The `damping` is relative to the root mean square of the singular values of the Jacobian of the tasks; `weights`
+    (joint_size,) are those of the squared joint rates.
     """
     machine, count, steps = equations.machine, len(joints), np.diff(times)
     targets = np.array(equations.target_function().map(len(times))(times[None, :]))

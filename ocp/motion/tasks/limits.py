@@ -166,9 +166,7 @@ LIMITED = {
 
 
 class JointBounds(NamedTuple):
-    """Limits of each joint in SI units (infinite if there is none): position, and largest absolute velocity,
-    acceleration, jerk and torque, and largest power that an actuator delivers. Shape (n,) each.
-    """
+    """Limits of each joint in SI units, infinite if there is none, as in `Limits`. Shape (n,) each."""
 
     lower: Array
     upper: Array
