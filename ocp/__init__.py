@@ -43,12 +43,12 @@ from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_co
 from ocp.motion.builders.standing.steps import StepsMotion, StepWeights, resolve_steps, steps_motion, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
-from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
+from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ik_configurations
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.local.rates import RateOptions, resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
-from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
@@ -72,12 +72,12 @@ for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan
 __all__ = [
     "AccelerationOptions", "AdaptiveCollocation", "Anywhere", "Audit", "AuditError", "BoundWarning", "Candidate",
     "Capture", "Certificate", "ClearanceConstraints", "Collocation", "Cone", "ControlStep", "Controller", "Cost",
-    "DeadEnd", "DynamicsSetup", "Finding", "Following", "FreeTime", "Goal", "Grasp", "IkConfigurations", "IkOptions",
+    "DeadEnd", "DynamicsSetup", "Finding", "FreeTime", "Goal", "Grasp", "IkConfigurations", "IkOptions",
     "IkSolver", "InFoot", "Incompleteness", "IndexAtLeast", "Indirect", "JointFriction", "Layer", "Limits",
     "MultipleShooting", "Phases", "Pinned", "Plan", "Problem", "ProblemError", "RateOptions", "Reconfiguration",
     "RefinementSettings", "RefinementWarning", "RollObstacles", "RollSettings", "Scene", "Sensitivity", "Solution",
     "SolveError", "SolverStatus", "Stabiliser", "StancePhase", "StandingSetup", "Start", "StepWeights", "Steps",
-    "StepsMotion", "StorageWarning", "Table", "TipTask", "ToolFreedom", "Unreachable", "VelocitySetup", "Waypoints",
+    "StepsMotion", "StorageWarning", "Table", "TipTask", "Unreachable", "VelocitySetup", "Waypoints",
     "Weights", "capture_problem", "certificate", "chained_capture", "dynamics_phases", "dynamics_problem",
     "ik_configurations", "inverse_kinematics", "joint_path", "joint_torques", "minimum_time_problem",
     "minimum_velocity_problem", "plan", "plan_problem", "prepare", "refine", "resolve", "resolve_accelerations",

@@ -156,26 +156,15 @@ class Clearance:
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
     """Compute a lower bound, valid at all times, of the distance between the bodies of each pair along a plan.
 
-    Args:
-        form: Formulation of the problem.
-        apart: One of its separations.
-        solution: The plan, with its states in the order of the problem.
-        p: Parameters. Shape (np,).
+    The states of the plan are in the order of the problem, and `p` (np,) are its parameters.
     """
     return clearance_along(apart, _track_of(form, apart, solution, p) if len(apart) else None)
 
 
 def clearance_of_pairs(problem: Problem, solution: Solution, name: str, pairs: Sequence[int]) -> Clearance:
-    """Return the `clearance` of chosen body pairs of a separation constraint; the bound of the closest pair is tight.
+    """Return the `clearance` of body pairs, given by their indices in the separation constraint `name` of a problem.
 
-    Args:
-        problem: The problem.
-        solution: A plan of the problem.
-        name: Name of the separation constraint.
-        pairs: Indices of the pairs.
-
-    Raises:
-        ProblemError: The plan does not belong to the problem.
+    The bound of the closest pair is tight. Raises ProblemError if the plan does not belong to the problem.
     """
     form = Formulation.of(problem)
     check_variables_match(form, solution)
@@ -218,11 +207,7 @@ def separation_frames(
 ) -> list[tuple[Separation, Frames]]:
     """Return each separation constraint of a problem with the poses of its body frames at K times, s.
 
-    Args:
-        suffix: As in `closest_pairs_along`.
-
-    Raises:
-        ProblemError: The plan does not belong to the problem.
+    See `closest_pairs_along` for `suffix` and the error that is raised.
     """
     fractions = times / solution.horizon
     return [(apart, track.frames(fractions)) for apart, track in _tracks(problem, solution, suffix)]
@@ -305,9 +290,9 @@ class _Search:
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
         """Return why a jump of a prescribed motion prevents a proof of clearance; "" if no jump is too large."""
-        begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
+        begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         jump, _ = self.track.prescribed.bounds(pair, begin, end)
         k = int(jump.argmax())
         if not jump[k] > self.settings.finest:

@@ -164,13 +164,10 @@ class _Newton:
         return integral
 
     def converged(self, chained: bool, rate: float = 1.0) -> tuple[np.ndarray, float, float] | None:
-        """Correct the states of the plan until they satisfy its dynamics; None if the corrections do not converge.
+        """Return corrected states, their running cost, and the ratio of successive corrections; None if these diverge.
 
-        Return the states, their running cost, and the ratio of successive corrections.
-
-        Args:
-            chained: Whether one motion starts from the plan's first state, not a separate motion in every interval.
-            rate: Ratio of successive corrections, as far as it is known.
+        With `chained`, one motion starts from the plan's first state, otherwise a separate one in every interval. The
+        ratio `rate` is that of an earlier call.
         """
         nx, x, current, last = self.along.form.nx, self.x, self.first, np.inf
         for _ in range(SETTINGS.corrections):

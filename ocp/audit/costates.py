@@ -235,10 +235,7 @@ class BackwardIntegration:
 def _state_limit_multipliers(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of state limits in mesh interval ``k`` that best explain the reported costates.
-
-    Values at the Gauss points (q, m) are multiplied by quadrature weights; values at both ends (2, m) are impulses.
-    """
+    """Return the best multipliers of state limits in interval ``k``, as in `BackwardIntegration.integrate`."""
     along, (q, nx) = back.along, (back.along.shape[1], back.along.form.nx)
     points, size, unit, weight = slice(k * q, (k + 1) * q), along.state_size, along.control_size, along.weight
     inside, atoms = np.zeros((q, len(along.state_limits.equal))), np.zeros((2, len(along.state_limits.equal)))

@@ -17,22 +17,7 @@ import numpy as np
 from ocp.audit.accessory import AccessoryProblem, end_conditions
 from ocp.audit.principle import describe_singular_arcs, global_optimum, groups
 from ocp.problem.formulation import Formulation
-from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
-
-
-class RankTolerances(NamedTuple):
-    """Singular values below which constraint gradients, scaled to length 1, count as linearly dependent.
-
-    Attributes:
-        size: Singular value in the controls of a stage below which constraints on them count as dependent.
-        seen: Value below which the remainder is a constraint on earlier stages. Between both values it is dropped.
-    """
-
-    size: float
-    seen: float
-
-
-FULL_RANK = RankTolerances(ROUNDING_SHARE, ROUNDING_SHARE)
+from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 
 @dataclass(frozen=True)
@@ -107,13 +92,11 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             reason = "the cost curves upwards only because of active limits without multipliers"
             return replace(result, flat=reason)
     if result.dependent:
-        # The controls affect implied conditions only by the error of the plan: pass these on to earlier stages, or drop
-        # their remainders. This frees more variations, so that an upward curvature remains conclusive.
-        for tolerances in (RankTolerances(SOLVER_SHARE, SOLVER_SHARE), RankTolerances(IMPLIED_SHARE, ROUNDING_SHARE)):
-            wider = _sweep(accessory, stages, tolerances)
-            if wider.least > FLAT_SHARE and not wider.flat:
-                result = wider
-                break
+        # The controls affect implied conditions only by the error of the plan: pass these on to earlier stages. This
+        # frees more variations, so that an upward curvature remains conclusive.
+        wider = _sweep(accessory, stages, SOLVER_SHARE)
+        if wider.least > FLAT_SHARE and not wider.flat:
+            result = wider
     if result.flat and (proof := global_optimum(along, accessory.negligible_cost)):
         return replace(result, flat="", proof=proof)
     if result.flat:
@@ -123,17 +106,17 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 
 
 def _sweep(
-    accessory: AccessoryProblem, sweep: _Linearised, tolerances: RankTolerances = FULL_RANK, weak: bool = False
+    accessory: AccessoryProblem, sweep: _Linearised, rank: float = ROUNDING_SHARE, weak: bool = False
 ) -> Curvature:
     """Compute the second variation of the cost along a plan by a backward sweep over all stages (mesh intervals).
 
     Cost, step and curvature of a stage refer to (z, 1, controls), so that they include the slope of the cost.
 
     Args:
-        tolerances: Which constraints count as dependent.
+        rank: Singular value below which gradients of constraints, scaled to length 1, count as linearly dependent.
         weak: Whether active limits without multipliers must stay active too.
     """
-    stages = _reduce_stages(accessory, sweep, weak, tolerances)
+    stages = _reduce_stages(accessory, sweep, weak, rank)
     mesh, horizon, t = accessory.along.mesh, accessory.along.solution.horizon, accessory.along.t
     n, nz, nu = accessory.along.shape[0], accessory.nz, accessory.nu
     m, rows, scale = nz + 1, _unit_end_rows(sweep.end_rows), sweep.scale
@@ -146,11 +129,11 @@ def _sweep(
         lift, move, stage_cost, remaining = stages[k]
         total = stage_cost + move.T @ (cost @ move)
         if len(rows):
-            later_rows = unit_rows(rows @ move[:nz], tolerances.size)
-            ((_, (inner,), (passed_on,)),) = _eliminate_controls(later_rows[None], m, tolerances)
+            later_rows = unit_rows(rows @ move[:nz], rank)
+            ((_, (inner,), (passed_on,)),) = _eliminate_controls(later_rows[None], m, rank)
             total, lift = inner.T @ total @ inner, lift @ inner
             remaining = np.vstack([remaining, passed_on])
-        rows = unit_rows(remaining, tolerances.size)[:, :nz] if len(remaining) else remaining[:, :nz]
+        rows = unit_rows(remaining, rank)[:, :nz] if len(remaining) else remaining[:, :nz]
         stage_hessian, mixed, cost = total[m:, m:], total[m:, :m], total[:m, :m]
         response = mixed
         if len(stage_hessian):
@@ -175,8 +158,8 @@ def _sweep(
         cost = (cost + cost.T) / 2
         gains.append(lift[m:, :nz] - lift[m:, m:] @ response[:, :nz])
     start_rows = _unit_end_rows(sweep.start_rows)
-    _, sizes, right = np.linalg.svd(unit_rows(np.vstack([rows, start_rows]), tolerances.size))
-    basis = right[int(np.sum(sizes > tolerances.size)) :].T
+    _, sizes, right = np.linalg.svd(unit_rows(np.vstack([rows, start_rows]), rank))
+    basis = right[int(np.sum(sizes > rank)) :].T
     starts = basis, np.zeros(0)
     if basis.shape[1]:
         values, vectors = np.linalg.eigh(basis.T @ (cost[:nz, :nz] + sweep.start_cost) @ basis)
@@ -268,9 +251,7 @@ class _Stage(NamedTuple):
     rows: np.ndarray
 
 
-def _reduce_stages(
-    accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances
-) -> list[_Stage]:
+def _reduce_stages(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, rank: float) -> list[_Stage]:
     """Eliminate from each stage (mesh interval) the control variations that its own active constraints determine.
 
     Stages with the same active constraints are treated together.
@@ -294,38 +275,35 @@ def _reduce_stages(
         rows.append(accessory.node_normals[members + 1][:, at_end] @ sweep.step[members, :nz])
         for i in np.flatnonzero(switches):  # a shifted switch is a single variation, of the mean
             rows.append(whole[:, 1:, nz + i] - whole[:, :1, nz + i])
-        for part, lifts, remaining in _eliminate_controls(np.concatenate(rows, axis=1), nz + 1, tolerances):
+        for part, lifts, remaining in _eliminate_controls(np.concatenate(rows, axis=1), nz + 1, rank):
             k = members[part]
             cost = np.swapaxes(lifts, 1, 2) @ sweep.stage[k] @ lifts
             reduced |= zip(k.tolist(), map(_Stage, lifts, sweep.step[k] @ lifts, cost, remaining), strict=True)
     return [reduced[k] for k in range(n)]
 
 
-def _eliminate_controls(
-    rows: np.ndarray, nz: int, tolerances: RankTolerances
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _eliminate_controls(rows: np.ndarray, nz: int, rank: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Eliminate the controls that linear constraints ``rows`` (K, r, nz + m) determine in K stages of m controls.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
-        free controls, (L, nz + m, nz + f); and the rows (L, r', nz) of the states that contain no control. Control
-        parts below the tolerances are dropped, or the row counts as free of controls.
+        free controls, (L, nz + m, nz + f); and the rows (L, r', nz) of the states that contain no control, or less of
+        it than the singular value `rank`.
     """
     size = rows.shape[2]
     lengths = np.linalg.norm(rows, axis=2, keepdims=True)
-    nonzero = lengths > tolerances.size * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
+    nonzero = lengths > rank * np.maximum(1.0, lengths.max(axis=1, keepdims=True, initial=0.0))
     rows = np.where(nonzero, rows / np.where(nonzero, lengths, 1.0), 0.0)
     left, sizes, right = np.linalg.svd(rows[:, :, nz:])
-    ranks = np.column_stack([(sizes > limit).sum(axis=1) for limit in tolerances])
     results = []
-    for (rank, visible), at in groups(ranks):
+    for (count,), at in groups((sizes > rank).sum(axis=1, keepdims=True)):
         turned, of_states = np.swapaxes(left[at], 1, 2), rows[at][:, :, :nz]
-        lift = np.zeros((len(at), size, size - rank))
+        lift = np.zeros((len(at), size, size - count))
         lift[:, :nz, :nz] = np.eye(nz)
-        solved = turned[:, :rank] @ of_states / sizes[at, :rank, None]
-        lift[:, nz:, :nz] = -np.swapaxes(right[at, :rank], 1, 2) @ solved
-        lift[:, nz:, nz:] = np.swapaxes(right[at, rank:], 1, 2)
-        results.append((at, lift, turned[:, max(rank, visible) :] @ of_states))
+        solved = turned[:, :count] @ of_states / sizes[at, :count, None]
+        lift[:, nz:, :nz] = -np.swapaxes(right[at, :count], 1, 2) @ solved
+        lift[:, nz:, nz:] = np.swapaxes(right[at, count:], 1, 2)
+        results.append((at, lift, turned[:, count:] @ of_states))
     return results
 
 

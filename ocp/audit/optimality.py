@@ -56,11 +56,7 @@ class Fit(NamedTuple):
 def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float) -> Fit | None:
     """Return the multipliers that minimise the estimated excess cost of a plan; None if the solver fails.
 
-    Args:
-        along: Linearisation of the plan.
-        known: Multipliers computed before.
-        curved: Hessian T H_uu in the controls at these. Shape (M, nu, nu).
-        cost: Size of the cost.
+    `curved` is the Hessian T H_uu, (M, nu, nu), at the multipliers that are `known`; `cost` is the size of the cost.
     """
     dual = _Dual(along, curved, cost)
     x = dual.program.solve()

@@ -235,22 +235,12 @@ def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
     """
     key = np.packbits(active).tobytes()
     if key not in along.pseudo_inverses:
-        along.pseudo_inverses[key] = pseudo_inverses(along.control_limits_u * along.control_size, active)
+        rows = along.control_limits_u * along.control_size
+        inverses = along.pseudo_inverses[key] = np.zeros(rows.transpose(0, 2, 1).shape)
+        k = np.flatnonzero(active.any(axis=1))
+        inverse = np.linalg.pinv(np.where(active[k, :, None], rows[k], 0.0), rcond=ROUNDING_SHARE)
+        inverses[k] = np.where(active[k, None], inverse, 0.0)  # without rounding errors for other limits
     return along.pseudo_inverses[key]
-
-
-def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverses of matrices (M, m, n) in which rows that are not ``active`` count as zero.
-
-    Shape (M, n, m) for ``active`` of shape (M, m).
-    """
-    m, count, n = rows.shape
-    inverses = np.zeros((m, n, count))
-    for pattern, members in groups(active):
-        if pattern.any():
-            inverse = np.linalg.pinv(rows[members][:, pattern], rcond=ROUNDING_SHARE)
-            inverses[members[:, None], :, np.flatnonzero(pattern)] = inverse.transpose(0, 2, 1)
-    return inverses
 
 
 def balance(

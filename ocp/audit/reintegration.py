@@ -113,11 +113,8 @@ def integrated_motion(along: Linearisation) -> IntegratedMotion:
 def stiff_motion(along: Linearisation, starts: np.ndarray, cells: int) -> IntegratedMotion | None:
     """Return the motion under the controls of a plan, by implicit integration, which stiff dynamics require.
 
-    The method is the backward differentiation formulas of CVODES. Returns None if it breaks down too.
-
-    Args:
-        along: The plan. starts: Its states at the start of every interval. Shape (N, nx).
-        cells: Number of cells of the fine grid in an interval.
+    Every interval has a number of `cells`, and `starts` (N, nx) are the states of the plan at their starts. The method
+    is the backward differentiation formulas of CVODES. Returns None if it breaks down too.
     """
     form, curve, unit = along.form, along.solution.control_interpolant, along.sizes.state
     horizon, sizes = along.solution.horizon, {"z": form.nx, "w": curve.values[0].size, "at": 1, "s": 1, "h": 1}
@@ -162,19 +159,6 @@ class Steps(NamedTuple):
     place: np.ndarray
     width: np.ndarray
 
-    @classmethod
-    def even(cls, cells: int, each: int) -> Steps:
-        """Return equal integration steps, one in each grid cell; every mesh interval has ``each`` cells."""
-        cell = np.arange(cells)
-        return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
-
-    @classmethod
-    def merge(cls, parts: list[Steps]) -> Steps:
-        """Merge several sets of integration steps into one, in increasing order of time."""
-        cell, place, width = (np.concatenate(values) for values in zip(*parts, strict=True))
-        order = np.lexsort((place, cell))
-        return cls(cell[order], place[order], width[order])
-
 
 class Flow:
     """Integrator of the dynamics and the running cost under the controls of a plan, from given states."""
@@ -200,9 +184,9 @@ class Flow:
         Returns:
             Values, shape (cells, nx + 1), and the accepted steps; after a breakdown also the steps tried last.
         """
-        each = len(chain) // self._intervals
+        cells, each = np.arange(len(chain)), len(chain) // self._intervals
         values = np.full((len(chain), starts.shape[1] + 1), np.nan)
-        cell, place, width = Steps.even(len(chain), each) if steps is None else steps
+        cell, place, width = steps or Steps(cells, (cells % each) / each, np.full(len(chain), 1.0 / each))
         current = np.hstack([starts, np.zeros((len(starts), 1))])
         accepted: list[Steps] = []
         for _ in range(SETTINGS.rounds):
@@ -230,7 +214,9 @@ class Flow:
             number = np.arange(len(cell)) - np.repeat(np.cumsum(parts) - parts, parts)
             width = width / np.repeat(parts, parts)
             place = place + number * width
-        return values, Steps.merge([*accepted, Steps(cell, place, width)])
+        cell, place, width = (np.concatenate(part) for part in zip(*accepted, (cell, place, width), strict=True))
+        order = np.lexsort((place, cell))
+        return values, Steps(cell[order], place[order], width[order])
 
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray

@@ -19,7 +19,7 @@ from ocp.curves import lagrange
 from ocp.problem.declarations import Variable
 from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
-from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
+from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
 GRID_FACTOR = 10  # refinement of the fine grid over the points of the plan
 COSTS = ("running", "terminal")
@@ -74,14 +74,6 @@ def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     controls = (lagrange(control.nodes, places) @ control.values).reshape(n * m, control.values.shape[2])
     segments, d = max((len(curve.breaks) - 1) // n, 1), len(curve.nodes)
     inside = places + np.where(places > 0, -0.1, 0.1) / (GRID_FACTOR * segments * d)
-    uniform = (mesh[:-1, None] + width[:, None] * (np.arange(segments) / segments)).ravel()
-    is_uniform = len(uniform) == len(curve.breaks) - 1 and np.abs(uniform - curve.breaks[:-1]).max() < MACHINE_SHARE
-    if is_uniform and np.isfinite(curve.values).all():
-        segment = np.clip((inside * segments).astype(int), 0, segments - 1)
-        basis = np.zeros((m, segments, d))
-        basis[np.arange(m), segment] = lagrange(curve.nodes, np.clip(places * segments - segment, 0.0, 1.0))
-        states = basis.reshape(m, -1) @ curve.values.reshape(n, segments * d, -1)
-        return states.reshape(n * m, curve.values.shape[2]), controls, fractions.ravel() * solution.horizon
     inner = mesh[:-1, None] + width[:, None] * inside
     segment = np.clip(np.searchsorted(curve.breaks, inner.ravel(), side="right") - 1, 0, len(curve.breaks) - 2)
     start, end = curve.breaks[segment], curve.breaks[segment + 1]
@@ -147,12 +139,9 @@ def evenly_spaced(grid: FineGrid) -> np.ndarray:
 
 
 def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
-    """Replace, in place, sizes that are much smaller than the largest size of the same unit by this largest size.
+    """Replace, in place, sizes (n,) that are at most a share `below` of the largest size of the same unit by this size.
 
-    Args:
-        size: Sizes of all states or controls, changed in place. Shape (n,).
-        places, declared: Indices and declarations of the states or controls, by name.
-        below: Largest share of the largest size of the unit at which a size is replaced.
+    `places` and `declared` are the indices and declarations of the states or controls, by name.
     """
     largest: dict[str, float] = {}
     for name, place in places.items():
@@ -253,13 +242,9 @@ def _sizes_by_unit(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) ->
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the size of each constraint that `Problem.watch` declares, relative to which its error is judged.
+    """Return the size of each watched row: the length of its reference path, or the change `by_variables` without one.
 
-    It is the length of the constraint's reference path or, without one, the change that states and controls cause.
-
-    Args:
-        by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).
-        path_lengths: Path lengths along the grid. Shape (M, rows).
+    Shapes: (rows,) of `by_variables`, and (M, rows) of `path_lengths` along the grid.
     """
     by_variables = np.where(form.watch_integral, horizon, 1.0) * by_variables
     length, size = _spread(path_lengths)[0], by_variables.copy()

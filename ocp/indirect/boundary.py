@@ -163,19 +163,11 @@ class BoundaryProblem:
         result = flow_integrator(x0=y, p=q)
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
-    def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and costates at points of a segment, and integrals over it; nan if integration fails.
-
-        Shapes (2 nx, places) and (2,).
-        """
-        states, integrals = evaluate(segment, y, q)
-        return states, integrals.ravel()
-
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """Return states and costates at a position 0..1 of a segment that has the start values ``y``. Shape (2 nx,)."""
         if place == 0.0:
             return y
-        return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
+        return evaluate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
 
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
@@ -304,11 +296,7 @@ def newton(
     def residual_at(z: np.ndarray) -> np.ndarray:
         return evaluate(residual, z, data, failed=np.inf)[0].ravel()
 
-    z, value = start, residual_at(start)
-    if value.size != start.size:
-        words = f"the boundary value problem has {value.size} conditions for {start.size} unknowns"
-        raise ProblemError(words, name="conditions", value=value.size, limit=start.size)
-    polished, stopped = False, None
+    z, value, polished, stopped = start, residual_at(start), False, None
     with stop_requests_polled():
         for steps in range(SETTINGS.steps + 1):
             size = float(np.max(np.abs(value), initial=0.0))
@@ -322,16 +310,11 @@ def newton(
                 break
             try:
                 with casadi_silenced():
-                    slopes = jacobian(z, data)
-            except RuntimeError:
-                status = SolverStatus.SOLVED if polished else SolverStatus.NOT_FINITE
-                return NewtonResult(z, size, steps, status, "the integration of the sensitivities fails")
-            try:
-                step = np.asarray(ca.solve(slopes, ca.DM(-value), "qr").full()).reshape(-1)
+                    step = np.asarray(ca.solve(jacobian(z, data), ca.DM(-value), "qr").full()).reshape(-1)
             except RuntimeError:
                 step = np.full(z.size, np.nan)
             if not np.all(np.isfinite(step)):
-                word = "Newton's matrix is singular: the plan is not unique"
+                word = "Newton's matrix is singular, so that the plan is not unique, or its integration fails"
                 if polished:
                     word = f"Converged in {steps} Newton steps; {word}"
                 status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED

@@ -94,12 +94,9 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return multipliers of the path equalities that make the Hamiltonian almost stationary in the free controls.
+        """Return multipliers (K, m) of the path equalities with which H is almost stationary in the ``free`` controls.
 
-        Args:
-            free: Which controls are off their bounds. Shape (K, nu), bool.
-            x, u, lam: States, controls, costates at K samples. Shape (K, .). t: Times, s. Shape (K,).
-            horizon: s. p: Parameters. Shape (np,).
+        ``free`` (K, nu) masks the controls off their bounds at K samples of states, controls and costates.
         """
         form, count = self.form, len(u)
         slope = ca.substitute([ca.gradient(self.value, form.u)], [self.mu], [ca.DM.zeros(len(form.path))])[0]
@@ -263,22 +260,16 @@ def random_values(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> 
 def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     """Solve the symbolic equations of an equality-constrained quadratic program for controls and multipliers.
 
-    [[W, A'], [A, 0]] w = rhs, by elimination of the block W (n, n) if that is positive definite.
+    [[W, A'], [A, 0]] w = rhs. If the block W (n, n) is positive definite, the matrix has a factorisation L D L' without
+    pivoting (Vanderbei 1995).
     """
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
-    curvature, constraint = matrix[:n, :n], matrix[n:, :n]
+    curvature = matrix[:n, :n]
     values = np.linalg.eigvalsh(random_values(curvature, ca.symvar(curvature), np.random.default_rng(0)))
-    if not (np.isfinite(values).all() and values[0] > ROUNDING_SHARE * values[-1]):  # not positive definite
-        return ca.solve(ca.densify(matrix), rhs)
-    factor = ca.ldl(curvature)
-    first = ca.ldl_solve(rhs[:n], *factor)
-    if matrix.shape[0] == n:
-        return first
-    through = ca.ldl_solve(ca.densify(constraint.T), *factor)
-    schur = ca.mtimes(constraint, through)
-    multiplier = ca.ldl_solve(ca.mtimes(constraint, first) - rhs[n:], *ca.ldl(schur))
-    return ca.vertcat(first - ca.mtimes(through, multiplier), multiplier)
+    if np.isfinite(values).all() and values[0] > ROUNDING_SHARE * values[-1]:
+        return ca.ldl_solve(rhs, *ca.ldl(matrix, False))
+    return ca.solve(ca.densify(matrix), rhs)
 
 
 @dataclass(frozen=True)

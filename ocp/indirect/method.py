@@ -25,7 +25,7 @@ from ocp.curves import PiecewisePolynomial
 from ocp.direct.discretisation import Collocation
 from ocp.direct.nlp import SOLVERS
 from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
-from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton
+from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, evaluate, newton
 from ocp.indirect.hamiltonian import Extremal, Hamiltonian, cost_gradient
 from ocp.indirect.seed import ControlArcs, read_arcs, read_unknowns
 from ocp.problem.formulation import Bounds, Formulation
@@ -289,8 +289,8 @@ class PreparedIndirect:
         cost = 0.0
         for i, (first, segment) in enumerate(segments):
             samples_y[i, 0] = first
-            states, integrals = self.boundary.integrate(self.boundary.dense, first, segment)
-            samples_y[i, 1:], cost = states.T, cost + float(integrals[0])
+            states, integrals = evaluate(self.boundary.dense, first, segment)
+            samples_y[i, 1:], cost = states.T, cost + float(integrals[0, 0])
         q: np.ndarray = np.array([segment for _, segment in segments]).T
         times = q[0][:, None] + q[1][:, None] * LOBATTO
         flat = samples_y.reshape(count, -1)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.errors import ProblemError, SolveError
+from ocp.errors import SolveError
 from ocp.indirect.hamiltonian import Hamiltonian
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import evaluate_at_samples
@@ -86,7 +86,7 @@ def read_arcs(
     x, lam, u = (stack(pool) for pool in (seed.states, seed.costates, seed.controls))
     guess = np.hstack([u[:, list(ham.smooth)], np.zeros((len(u), len(form.path)))])
     slope = evaluate_at_samples(outputs, x, lam, seed.t[:, None], seed.horizon, p, u[:, index_of], guess)[3]
-    seed_low, seed_high = seed_bounds(form, seed, bounds)
+    seed_low, seed_high = seed_bounds(form, seed)
     check_singular(ham, seed, seed_low[index_of], seed_high[index_of])
 
     at_lower = signs(slope) > 0
@@ -110,13 +110,10 @@ def read_arcs(
     return ControlArcs(switches, tuple(j for _, j in events), counts, np.array(values))
 
 
-def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+def seed_bounds(form: Formulation, seed: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Return the control bounds under which a direct solution (seed) was computed. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
-    try:
-        low, high = source.bound_values(source.parameter_vector(seed.parameters))
-    except ProblemError:  # a loaded seed whose parameters do not fit its problem
-        source, (low, high) = form, bounds
+    low, high = source.bound_values(source.parameter_vector(seed.parameters))
     places = source.bounds.places["control"]
     index = np.concatenate([places[source.controls[name]] for name in form.controls])
     return low[index], high[index]

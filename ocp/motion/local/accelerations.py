@@ -9,7 +9,7 @@ limits and rates, and stops with a reason if the foot lifts off or the motion di
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -28,7 +28,7 @@ from ocp.motion.local.rates import least_rates
 from ocp.motion.tasks.checks import check_length, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Start
-from ocp.motion.tasks.limits import checked_point
+from ocp.motion.tasks.limits import prescribed_point
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 
@@ -114,14 +114,6 @@ class AccelerationOptions:
         require.flag("stop_at_lift_off", self.stop_at_lift_off)
         require.positive("speed_limit", self.speed_limit)
 
-    def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
-        """Return the desired zero moment point (x, y) of a machine, m, as a function of time that checks its value."""
-        zmp = machine.most_stable_point if self.zmp is None else self.zmp
-        if callable(zmp):
-            return lambda time: checked_point(zmp(time), "zmp")
-        point = checked_point(zmp, "zmp")
-        return lambda time: point
-
 
 class _TaskHierarchy:
     """Joint accelerations that perform tasks of decreasing priority, each in the null space of the tasks before."""
@@ -179,7 +171,7 @@ def accelerations(
     acting = wrenches_at(wrenches, machine, (), q, time=time)
     jacobian = equations.jacobian(no_base, q)
     task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), progress=(time,))
-    place = own.zmp_target(machine)(time)
+    place = prescribed_point(own.zmp, machine, time, "zmp")
     zmp_rows = machine.zmp_rows(q, qd, place, acting)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
 
@@ -318,7 +310,6 @@ def resolve_accelerations(
     at_rest = isinstance(begin.velocity, str) and begin.velocity == "rest"
     rates = np.zeros(n) if at_rest else begin.velocity
     velocities = require.array("start: velocity", rates, (n,), meaning="one entry for each joint")
-    own = replace(own, zmp=own.zmp_target(machine))
 
     def law_function(symbols: Any) -> Any:
         time, q, qd = state = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)

@@ -220,8 +220,8 @@ class _SymbolicLoop(NamedTuple):
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
     """Return the closed-form solvers of a chain, one for each suitable choice of redundant joints from `lockable`."""
-    if len(chain.order) == SCARA:
-        return _scara_forms(chain)
+    if is_scara(chain):
+        return (ClosedForm(chain, (), "scara", tuple(j for j in chain.order if chain.revolute[j])),)
     n, forms = len(chain.order), list[ClosedForm]()
     for redundant in combinations(chain.order if lockable is None else lockable, n - SIX) if n >= SIX else ():
         if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
@@ -232,19 +232,13 @@ def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[C
     return tuple(forms)
 
 
-def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solver of a four-joint chain in a tuple, which is empty if the chain is no SCARA."""
-    revolute = tuple(j for j in chain.order if chain.revolute[j])
-    prismatic = [j for j in chain.order if not chain.revolute[j]]
-    if len(prismatic) != 1 or _kind_of(chain, revolute) != "parallel":
-        return ()
-    sine = float(np.linalg.norm(np.cross(chain.axes[prismatic[0]], chain.axes[revolute[0]])))
-    return (ClosedForm(chain, (), "scara", revolute),) if sine < FORMS.straight else ()
-
-
 def is_scara(chain: Chain) -> bool:
     """Return whether a chain is a SCARA: three parallel revolute joints and a prismatic one along them."""
-    return len(chain.order) == SCARA and bool(_scara_forms(chain))
+    revolute = tuple(j for j in chain.order if chain.revolute[j])
+    prismatic = [j for j in chain.order if not chain.revolute[j]]
+    if len(chain.order) != SCARA or len(prismatic) != 1 or _kind_of(chain, revolute) != "parallel":
+        return False
+    return float(np.linalg.norm(np.cross(chain.axes[prismatic[0]], chain.axes[revolute[0]]))) < FORMS.straight
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:

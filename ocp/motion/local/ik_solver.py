@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from models import FixedBase, Machine
 from models.checks import Array, ArrayInput
-from models.machines.machine import with_tip
 from models.spatial import least_rotation, rotation_matrices
-from ocp.errors import ProblemError, problem_errors, require
+from ocp.errors import ProblemError, require
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
-from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms, is_scara
+from ocp.motion.local.closed_forms import SIX, PoseSolver, closed_forms, is_scara
 from ocp.motion.local.elimination import elimination_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
@@ -132,53 +131,23 @@ def sample_shares(first: int, count: int, dimension: int) -> Array:
 
 
 class IkSolver:
-    """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses.
+    """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses of its tip.
 
-    Six joints have at most 16 configurations, which are found in closed form or by elimination. With further joints,
-    and where the task leaves angles of the tip open, these parameters are sampled, so that configurations on all
-    branches are listed at each sample. Joints that do not move the tip are in the middle of their limits.
+    Six joints have at most 16 configurations, which are found in closed form or by elimination. Further joints are
+    sampled, so that configurations on all branches are listed at each sample. Joints that do not move the tip are in
+    the middle of their limits. For tasks that leave a part of the orientation free, see `ik_configurations`.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        *,
-        link: str | None = None,
-        point: ArrayInput = (0.0, 0.0, 0.0),
-        free: ToolFreedom = ToolFreedom.NONE,
-        tool_axis: ArrayInput = (0.0, 0.0, 1.0),
-        within: float = 0.0,
-        limits: bool = True,
-        samples: int = 36,
-    ) -> None:
-        """Prepare the inverse kinematics of an arm for a given tip, and for the orientations that a task leaves free.
+    def __init__(self, machine: Machine, *, limits: bool = True, samples: int = 36) -> None:
+        """Prepare the inverse kinematics of an arm, within its position limits if `limits`.
 
-        Args:
-            machine: Machine on a fixed base.
-            link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
-            free: Part of the orientation that the task leaves free. ROLL: the angle about `tool_axis`; CONE: also the
-                direction of this axis, within a cone; ROTATION: all.
-            tool_axis: Tool axis in the frame of the tip. Shape (3,).
-            within: Half-angle of the cone, rad, between 0 and pi.
-            limits: Whether the position limits of the robot apply.
-            samples: Number of samples of the parameters, if there are any.
-
-        Raises:
-            ProblemError: The machine has a moving base, no six of its joints determine the pose of the tip, or an
-                argument is invalid.
+        Redundant joints are sampled at a number of `samples`. Raises ProblemError if the base moves, no six joints
+        determine the pose of the tip, or an argument is invalid.
         """
         require.instance("machine", machine, FixedBase)
-        require.instance("free", free, ToolFreedom)
-        if free is ToolFreedom.CONE:
-            require.positive("within", within, below=np.pi)
         require.flag("limits", limits)
         require.count("samples", samples, 1)
-        with problem_errors():
-            tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
-        axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
-        if not np.linalg.norm(axis) > 0:
-            raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
-        arm = ArmSolver.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
+        arm = ArmSolver.of(machine, *joint_range(machine, limits))
         if arm is None:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
@@ -190,7 +159,7 @@ class IkSolver:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that are sampled: redundant joints and angles that the task leaves open."""
+        """Names of the redundant joints, which are sampled."""
         return self.arm.parameters(self.arm.solvers[0])
 
     def __call__(self, positions: ArrayInput, rotations: ArrayInput) -> IkConfigurations:
@@ -198,8 +167,7 @@ class IkSolver:
 
         Args:
             positions: Positions in the world. Shape (3,) or (N, 3), m.
-            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3). Only the part that the task
-                prescribes matters: with a free roll, the direction of the tool axis.
+            rotations: Rotation matrices. Shape (3, 3) or (N, 3, 3).
 
         Raises:
             ProblemError: A shape is wrong, a value is not finite, or a matrix is not a rotation.
@@ -229,13 +197,20 @@ class ArmSolver:
 
     @classmethod
     def of(
-        cls, tip: Machine, lower: Array, upper: Array, *, free: ToolFreedom, tool_axis: Array, within: float = 0.0
+        cls,
+        tip: Machine,
+        lower: Array,
+        upper: Array,
+        *,
+        free: ToolFreedom = ToolFreedom.NONE,
+        tool_axis: ArrayInput = (0.0, 0.0, 1.0),
+        within: float = 0.0,
     ) -> ArmSolver | None:
         """Prepare an arm for inverse kinematics; return None if its base moves or no six joints determine its tip."""
         chain = Chain.of(tip)
         if chain is None or (free is ToolFreedom.CONE and len(chain.order) < SIX):
             return None
-        axis, axes, sampled = tool_axis / np.linalg.norm(tool_axis), np.zeros((0, 3)), 0
+        axis, axes, sampled = np.array(tool_axis), np.zeros((0, 3)), 0
         if free is ToolFreedom.ROTATION:
             axes = np.eye(3)
         elif free is ToolFreedom.ROLL and len(chain.order) < SIX and not is_scara(chain):
@@ -352,8 +327,8 @@ def _pose_solvers(chain: Chain, axes: Array) -> tuple[tuple[PoseSolver, ...], tu
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
         return (), ()
-    if count == SCARA and (forms := closed_forms(extended)):
-        return forms, ()
+    if is_scara(extended):
+        return closed_forms(extended), ()
     auxiliary = tuple(range(len(extended.axes), len(extended.axes) + SIX - count))
     if auxiliary:
         rng = np.random.default_rng(ARM.seed)

@@ -8,23 +8,22 @@ plans.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy
 
-from models import CollisionScene, FreeFloating, Machine, find_wheels
+from models import FreeFloating, Machine, find_wheels
 from models.checks import Array, real
 from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
 from ocp.curves import integrator
 from ocp.errors import ProblemError, require
-from ocp.motion.local.collisions import checked_collision_scene, distances_along
 from ocp.motion.tasks.checks import checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Start
@@ -48,8 +47,6 @@ class LocalSolution:
         cost: Integral of half the (weighted) squared joint rates, up to each time. Shape (M,).
         tolerance: Absolute and relative tolerance of the integration.
         stopped: Reason why the motion ends before the horizon, None if it does not.
-        clearance: Least distance of two bodies, m, nan without a collision scene. Shape (M,).
-        nearest: Names of these two bodies at each time; empty without a collision scene.
         task_error: Target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (M, rows).
     """
 
@@ -64,8 +61,6 @@ class LocalSolution:
     tolerance: float
     stopped: str | None = None
     task_error: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    clearance: Array = field(default_factory=lambda: np.zeros(0))
-    nearest: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         end = f", stopped: {self.stopped}" if self.stopped else ""
@@ -115,7 +110,6 @@ def resolve(
     *,
     start: Any,
     samples: Any = 501,
-    scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
     """Compute a motion along tasks by resolved-rate control, with the least joint rates at each time.
@@ -130,7 +124,6 @@ def resolve(
         horizon: Final time, s; that of the tasks if None.
         start: Start configuration, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
-        scene: Collision scene of the machine; the distances of its bodies are reported and have no effect.
         options: Weights, damping and tolerance.
 
     Raises:
@@ -149,23 +142,14 @@ def resolve(
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
     model = on_symbols(lambda symbols: _Model(equations, rate_weights, own.damping, symbols))
     states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
-    solution = _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
-    if scene is None:
-        return solution
-    distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
-    nearest = tuple(scene.labels[k] for k in distances.argmin(axis=1).tolist()) if distances.size else ()
-    return replace(solution, clearance=distances.min(axis=1, initial=np.inf), nearest=nearest)
+    return _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the damped least-squares joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v for task velocities v, with
-    the Jacobian G and the weights W of the rates. Shape (n, k).
+    """Return the damped least-squares joint rates W^-1 G' (G W^-1 G' + damping^2 1)^-1 v. Shape (n, k).
 
-    Args:
-        jacobian: Rows of the task, G. Shape (m, n), m <= n.
-        velocity: v, or several as columns. Shape (m, k).
-        damping: In units of the Jacobian.
-        weights: Diagonal of W, weights of the squared joint rates; all 1 if None. Shape (n,).
+    G (m, n), m <= n, is the Jacobian, v (m, k) are task velocities, and W = diag(weights) weighs the squared joint
+    rates, all by 1 if None. The damping is in units of the Jacobian.
     """
     weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
     square = ca.mtimes(jacobian, weighted) + damping**2 * ca.DM.eye(jacobian.shape[0])
@@ -208,49 +192,30 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator over one interval between samples; its parameters are start time and duration, s."""
-        span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
-        rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
-        ode, running = rates(span[0] + fraction * span[1], self.state)
-        problem = {"t": fraction, "x": self.state, "p": span, "ode": span[1] * ode, "quad": span[1] * running}
-        return _cvodes(problem, 0.0, np.array([1.0]), tolerance)
-
-
-def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Any:
-    """Return a CVODES integrator of differential equations from the time `start` to given times."""
-    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": start}
-    return integrator("motion", problem, times.tolist(), **options)
-
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
     """Return states and costs at the sample times that an integration reaches, and the reason if it ends early."""
-    try:
-        problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
-        result = _cvodes(problem, times[0], times[1:], tolerance)(x0=first)
-        states = np.vstack([first, np.array(result["xf"]).T])
-        costs = np.concatenate([[0.0], np.array(result["qf"]).ravel()])
-        if np.isfinite(states).all() and np.isfinite(costs).all():
-            return states, costs, None
-    except RuntimeError:
-        pass  # integrate again from sample to sample to find how far it goes
-    step = model.one_interval(tolerance)
-    states_so_far, costs_so_far = [first], [0.0]
-    for begin, end in pairwise(times):
-        try:
-            result = step(x0=states_so_far[-1], p=[begin, end - begin])
-            state, cost = np.array(result["xf"]).ravel(), float(result["qf"])
-            usable = np.isfinite([*state, cost]).all() and np.isfinite(np.array(model.rate(end, state))).all()
-        except RuntimeError:
-            usable = False
-        if not usable:
-            manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
-            reason = f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
-            reason += f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
-            return np.array(states_so_far), np.array(costs_so_far), reason
-        states_so_far.append(state)
-        costs_so_far.append(costs_so_far[-1] + cost)
-    return np.array(states_so_far), np.array(costs_so_far), None
+    problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
+    options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": times[0]}
+    run = integrator("motion", problem, times[1:].tolist(), **options)
+    states, costs = np.full((len(times), first.size), np.nan), np.full(len(times), np.nan)
+    states[0], costs[0] = first, 0.0
+    memory, evaluate = run.buffer()  # if the integration fails, the samples before the failure remain
+    memory.set_arg(run.index_in("x0"), first.data)
+    for name, values in (("xf", states), ("qf", costs)):
+        memory.set_res(run.index_out(name), values[1:].data)
+    with contextlib.suppress(RuntimeError):
+        evaluate()
+    rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
+    usable = np.isfinite(np.column_stack([states, costs, rates])).all(axis=1)
+    if usable.all():
+        return states, costs, None
+    count = max(int(usable.argmin()), 1)
+    begin, end = times[count - 1 : count + 1]
+    manipulability = float(_manipulabilities(np.array(model.outputs(begin, states[count - 1])[1])[None])[0])
+    reason = f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
+    reason += f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
+    return states[:count], costs[:count], reason
 
 
 def _report(
@@ -272,7 +237,6 @@ def _report(
         tolerance=tolerance,
         stopped=stopped,
         task_error=error.reshape(size, len(times)).T,
-        clearance=np.full(len(times), np.nan),
     )
 
 
@@ -366,11 +330,8 @@ def track_tasks(
 ) -> LocalMotion:
     """Track tasks from several start configurations (K, joint_size) and (K, base_size) by resolved-rate control.
 
-    Args:
-        times: Increasing times, s. Shape (M,).
-        weights: Weights of the squared joint rates. Shape (joint_size,).
-        damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.
-        lower, upper: Limits of the joints. Shape (joint_size,).
+    The `damping` is relative to the root mean square of the singular values of the Jacobian of the tasks; `weights`
+    (joint_size,) are those of the squared joint rates.
     """
     machine, count, steps = equations.machine, len(joints), np.diff(times)
     targets = np.array(equations.target_function().map(len(times))(times[None, :]))
@@ -424,19 +385,9 @@ def track_tasks(
             base_now, joints_now = move_base(mean, h), np.clip(joints_now + mean, lower, upper)
             bases.append(base_now)
             configurations.append(joints_now)
-    joint_path = np.stack(configurations, axis=1)
-    rates = np.diff(joint_path, axis=1) / steps[:, None]
+    motions = LocalMotion.through(times, np.stack(bases, axis=1), np.stack(configurations, axis=1), weights)
     errors_along = np.stack(errors, axis=1)
-    worst = errors_along.argmax(axis=1)
-    return LocalMotion(
-        times,
-        np.stack(bases, axis=1),
-        joint_path,
-        np.concatenate([rates, rates[:, -1:]], axis=1),
-        np.asarray(np.einsum("kmn,n,m->k", rates**2, weights, steps) / 2),
-        errors_along.max(axis=1),
-        times[worst],
-    )
+    return replace(motions, pose_error=errors_along.max(axis=1), worst_time=times[errors_along.argmax(axis=1)])
 
 
 def _damped_rates(

@@ -86,37 +86,35 @@ class TaskEquations:
         parts = []
         for task in (part.task for part in self.bound):
 
-            def expression_of(name: str, *shapes: tuple[int, int], rate: bool = False, task: TipTask = task) -> Any:
-                track, words = getattr(task, name), f"{name} rate" if rate else name
-                return track_expression(track.rate if rate else track, time, shapes, label=words, begin=task.begin)
+            def value_and_rate(
+                name: str, *shapes: tuple[int, int], rates: Any = ((3, 1),), task: TipTask = task
+            ) -> Any:
+                """Return a target and the rate that its track states, or None."""
+                track, begin = getattr(task, name), task.begin
+                value, rate = track_expression(track, time, shapes, label=name, begin=begin), None
+                if hasattr(track, "rate"):
+                    rate = track_expression(track.rate, time, rates, label=f"{name} rate", begin=begin)
+                return value, rate
 
             if task.velocity is not None:
-                parts.append(pace * expression_of("velocity", (task.size, 1)))
+                parts.append(pace * value_and_rate("velocity", (task.size, 1))[0])
             if task.position is not None:
                 short = task.along_reference and len(task.linear) < 3
                 shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
-                value = _whole(task, expression_of("position", *shapes))
-                if hasattr(task.position, "rate"):
-                    velocity = _whole(task, expression_of("position", *shapes, rate=True))
-                else:
-                    velocity = _derivative(value, time)
-                parts += [value, pace * velocity]
+                value, rate = value_and_rate("position", *shapes, rates=shapes)
+                value = _whole(task, value)
+                parts += [value, pace * (_derivative(value, time) if rate is None else _whole(task, rate))]
             if task.orientation is not None:
-                value = expression_of("orientation", (4, 1), (3, 3))
+                value, angular = value_and_rate("orientation", (4, 1), (3, 3))
                 rotation = on_scalars(rotation_from_quaternion)(value) if value.shape == (4, 1) else value
-                if hasattr(task.orientation, "rate"):
-                    angular = expression_of("orientation", (3, 1), rate=True)
-                else:
+                if angular is None:
                     angular = _angular_velocity(rotation, ca.reshape(_derivative(ca.vec(rotation), time), 3, 3))
                 parts += [ca.vec(rotation), pace * angular]
             if task.direction is not None:
-                value = expression_of("direction", (3, 1))
+                value, rate = value_and_rate("direction", (3, 1))
                 length = ca.norm_2(value)
                 unit = value / length
-                if hasattr(task.direction, "rate"):
-                    unit_rate = expression_of("direction", (3, 1), rate=True) / length
-                else:
-                    unit_rate = _derivative(unit, time)
+                unit_rate = _derivative(unit, time) if rate is None else rate / length
                 parts += [unit, pace * cross_product(unit, unit_rate)]
         return ca.densify(ca.vertcat(*parts))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias, get_args
 from warnings import warn
@@ -31,15 +31,6 @@ class InFoot:
     def __post_init__(self) -> None:
         require.nonnegative("InFoot: margin", self.margin, unit="m")
 
-    def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon of a machine is too small for the margin that this rule demands."""
-        directions, support = machine.moving_directions, machine.support
-        half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
-        largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
-        if self.margin >= largest * (1 - 1e-9):
-            words = f"InFoot: margin {self.margin!r} m is too large for the support, which allows {largest:g} m at most"
-            raise ProblemError(words, name="margin", value=self.margin, limit=largest)
-
 
 @dataclass(frozen=True)
 class IndexAtLeast:
@@ -55,57 +46,38 @@ class IndexAtLeast:
             words = f"IndexAtLeast: value must be below 1, not {self.value!r}; for 1 use Pinned()"
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
-    def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return opposite corners (2,), m, of the rectangle of zero moment points with sufficient stability index."""
-        radius = machine.half_widths * np.sqrt(1 - self.value)
-        return machine.most_stable_point - radius, machine.most_stable_point + radius
-
 
 @dataclass(frozen=True)
 class Pinned:
-    """Rule that the zero moment point stays at (x, y), m, or at the machine's most stable point if None.
+    """Rule that the zero moment point stays at a place, or follows it.
 
     This holds in the directions in which motion moves the point, see Standing.moving_directions; in the others it stays
     inside the support.
+
+    Attributes:
+        point: (x, y), m, or a function of the CasADi symbol of time, s; None for the machine's most stable point.
     """
 
     point: Any = None
 
     def place(self, machine: Standing, time: Any) -> Any:
-        """Return the prescribed zero moment point. Shape (2, 1), m."""
-        point = machine.most_stable_point if self.point is None else self.point
-        return checked_point(point, "Pinned: point")
+        """Return the prescribed zero moment point at a time. Shape (2, 1), m."""
+        return prescribed_point(self.point, machine, time, "Pinned: point")
 
 
-@dataclass(frozen=True)
-class Following:
-    """Rule that the zero moment point follows a reference (x, y), m: a function of the CasADi symbol of time, s.
-
-    This holds in the directions in which motion moves the point, as for Pinned.
-    """
-
-    reference: Callable[[Any], Any]
-
-    def place(self, machine: Standing, time: Any) -> Any:
-        """Return the reference position of the zero moment point at a time. Shape (2, 1), m."""
-        if not callable(self.reference):
-            words = f"Following: a function of time is expected, not {self.reference!r}"
-            raise ProblemError(words, name="Following", value=self.reference)
-        return checked_point(self.reference(time), "Following: the reference")
-
-
-def checked_point(value: Any, name: str) -> Any:
-    """Return a point (x, y), m, as a CasADi column; raise ProblemError if it is no pair of numbers or expressions."""
+def prescribed_point(point: Any, machine: Standing, time: Any, name: str) -> Any:
+    """Return a zero moment point (2, 1), m, that is given as in `Pinned`; raise ProblemError if it is no pair."""
+    value = machine.most_stable_point if point is None else point(time) if callable(point) else point
     try:
-        point = expression(value)
+        place = expression(value)
     except NOT_NUMBERS:
-        point = ca.DM()
-    numeric = isinstance(point, ca.DM)
-    if point.numel() != 2 or 1 not in point.shape or (numeric and not np.isfinite(np.array(point)).all()):
+        place = ca.DM()
+    numeric = isinstance(place, ca.DM)
+    if place.numel() != 2 or 1 not in place.shape or (numeric and not np.isfinite(np.array(place)).all()):
         shown = value if numeric else str(value)  # expressions cannot be pickled
         words = f"{name} must be two numbers (x, y), not {value!r}"
         raise ProblemError(words, name=name.rpartition(" ")[2], value=shown)
-    return ca.vec(point)
+    return ca.vec(place)
 
 
 @dataclass(frozen=True)
@@ -113,7 +85,7 @@ class Anywhere:
     """Rule that the zero moment point is not checked, so that the machine may tip over."""
 
 
-ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
+ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
@@ -126,12 +98,13 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
         return normals, offsets + zmp.margin
     open_edges = np.zeros(len(offsets), dtype=bool)
     if isinstance(zmp, IndexAtLeast):
-        low, high = zmp.region(machine)
+        radius = machine.half_widths * np.sqrt(1 - zmp.value)
+        low, high = machine.most_stable_point - radius, machine.most_stable_point + radius
         corners = np.array(np.meshgrid(*np.transpose([low, high]))).reshape(2, 4)
         open_edges = (normals @ corners).min(axis=1) < offsets
         sides = np.vstack([np.eye(2), -np.eye(2)])
         return np.vstack([sides, normals[open_edges]]), np.concatenate([low, -high, offsets[open_edges]])
-    if isinstance(zmp, Pinned | Following):
+    if isinstance(zmp, Pinned):
         directions = machine.moving_directions
         open_edges = np.abs(normals - normals @ directions.T @ directions).max(axis=1) > PARALLEL
     return normals[open_edges], offsets[open_edges]
@@ -158,23 +131,27 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
     """Raise ProblemError if a zero moment point rule has the wrong type or demands a point outside the support."""
     if not isinstance(zmp, ZmpRule):
-        words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
+        words = f"zmp must be InFoot, IndexAtLeast, Pinned or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
     if isinstance(zmp, InFoot):
-        zmp.check(machine)
-    if not isinstance(zmp, Pinned | Following):
+        directions, support = machine.moving_directions, machine.support
+        half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
+        largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
+        if zmp.margin >= largest * (1 - 1e-9):
+            words = f"InFoot: margin {zmp.margin!r} m is too large for the support, which allows {largest:g} m at most"
+            raise ProblemError(words, name="margin", value=zmp.margin, limit=largest)
+    if not isinstance(zmp, Pinned):
         return
-    name = type(zmp).__name__
-    for time in np.linspace(0.0, horizon, REFERENCE_SAMPLES if isinstance(zmp, Following) else 1):
+    for time in np.linspace(0.0, horizon, REFERENCE_SAMPLES if callable(zmp.point) else 1):
         place = np.array(ca.DM(zmp.place(machine, ca.DM(time)))).ravel()
         if not np.isfinite(place).all():
-            words = f"{name}: the zero moment point {place.tolist()} at {time:.4g} s is not finite"
-            raise ProblemError(words, name=name, value=place, time=float(time))
+            words = f"Pinned: the zero moment point {place.tolist()} at {time:.4g} s is not finite"
+            raise ProblemError(words, name="Pinned", value=place, time=float(time))
         inside = float(machine.support.margin(machine.nearest_reachable(place)))
         if inside < -ROUNDING_M:
-            words = f"{name}: {place.tolist()} m at {time:.4g} s is {-inside:.4g} m outside the support, where the "
+            words = f"Pinned: {place.tolist()} m at {time:.4g} s is {-inside:.4g} m outside the support, where the "
             words += "machine tips over; stay inside, or give another support"
-            raise ProblemError(words, name=name, value=place, limit=machine.support.vertices, time=float(time))
+            raise ProblemError(words, name="Pinned", value=place, limit=machine.support.vertices, time=float(time))
 
 
 LIMITED = {
@@ -189,9 +166,7 @@ LIMITED = {
 
 
 class JointBounds(NamedTuple):
-    """Limits of each joint in SI units (infinite if there is none): position, and largest absolute velocity,
-    acceleration, jerk and torque, and largest power that an actuator delivers. Shape (n,) each.
-    """
+    """Limits of each joint in SI units, infinite if there is none, as in `Limits`. Shape (n,) each."""
 
     lower: Array
     upper: Array

@@ -127,31 +127,20 @@ class SpeedProfile:
     def _time_inside(self, segment: NDArray[np.intp], distance: Array) -> Array:
         """Return the times (M,), from the starts of given segments (M,), at which distances (M,) are covered."""
         v, a, j, high = self.speed[segment], self.acceleration[segment], self.jerk[segment], np.diff(self.t)[segment]
-        even = (a == 0) & (j == 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.where(even, np.minimum(distance / v, high), high)
-        todo = np.flatnonzero(~even)
-        # Newton steps inside a bracket, since distance increases with time
-        high = high[todo]
-        whole, last, _ = integrate_jerk(v[todo], a[todo], j[todo], high)
-        share = np.clip(distance[todo] / np.maximum(whole, 1e-300), 0.0, 1.0)
-        # as if the acceleration were constant
-        reached = np.sqrt((1 - share) * v[todo] ** 2 + share * last**2)
-        t[todo] = np.minimum(2 * share * whole / np.maximum(v[todo] + reached, 1e-300), high)
-        low = np.zeros_like(high)
+        t, low, todo = np.where(distance > 0, high / 2, 0.0), np.zeros_like(high), np.arange(len(high))
         for _ in range(60):  # more than halving a bracket to the last digit takes
-            if not todo.size:
-                break
             x = t[todo]
             covered, speed, _ = integrate_jerk(v[todo], a[todo], j[todo], x)
             error = covered - distance[todo]
-            low, high = np.where(error <= 0, x, low), np.where(error >= 0, x, high)
+            low[todo], high[todo] = np.where(error <= 0, x, low[todo]), np.where(error >= 0, x, high[todo])
+            # a Newton step, unless it leaves the bracket; distance increases with time
             with np.errstate(divide="ignore", invalid="ignore"):
                 new = x - error / speed
-            new = np.where((new >= low) & (new <= high), new, (low + high) / 2)
+            new = np.where((new >= low[todo]) & (new <= high[todo]), new, (low[todo] + high[todo]) / 2)
             t[todo] = new
-            moving = np.abs(new - x) > 4e-16 * np.abs(self.duration)
-            todo, low, high = todo[moving], low[moving], high[moving]
+            todo = todo[np.abs(new - x) > 4e-16 * self.duration]
+            if not todo.size:
+                break
         return np.asarray(t)
 
 
@@ -211,9 +200,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
     require.nonnegative("ramp: change", change)
     for name, value in (("acceleration", acceleration), ("jerk", jerk)):
         require.positive(f"ramp: {name}", value)
-    if change * jerk >= acceleration**2:
-        return change / acceleration + acceleration / jerk
-    return 2 * sqrt(change / jerk)
+    return sum(time for time, _ in ramp_phases(change, acceleration, jerk))
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, Solution, certificate, solve
@@ -17,7 +19,7 @@ from ocp.audit.accessory import AccessoryProblem
 from ocp.audit.costates import adjoint
 from ocp.audit.curvature import Curvature, curvature
 from ocp.audit.linearisation import Linearisation
-from ocp.audit.principle import balance, pseudo_inverses
+from ocp.audit.principle import balance
 from ocp.problem.formulation import Formulation
 from tests.ocp.audit.drawn import random_program
 from tests.ocp.problems import Array
@@ -35,6 +37,12 @@ def second_order(problem: Problem, solution: Solution) -> Curvature:
 def look(problem: Problem, method: Any = METHOD, **how: Any) -> tuple[Solution, Curvature]:
     solution = solve(problem, method, check=False, **how)  # as the solver leaves it
     return solution, second_order(problem, solution)
+
+
+def inverse_of(rows: Array, active: NDArray[np.bool_]) -> Array:
+    """Pseudo-inverses of matrices in which rows that are not active count as zero."""
+    inverse = np.linalg.pinv(np.where(active[:, :, None], rows, 0.0))
+    return np.asarray(np.where(active[:, None], inverse, 0.0))
 
 
 def oscillator(horizon: float, stiffness: float = 1.0, unit: float = 1.0, price: float = 1.0) -> Problem:
@@ -245,9 +253,7 @@ def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
     lower = np.array([[False, False], [True, True], [True, True]])
     upper = np.array([[True, True], [False, False], [True, True]])
     expected = [[2.0, 0.0], [0.0, -3.0], [2.0, -3.0]]  # an upper bound pushes back only
-    np.testing.assert_allclose(
-        balance(gradient, eye, lower, upper, inverse=pseudo_inverses(eye, lower | upper)), expected
-    )
+    np.testing.assert_allclose(balance(gradient, eye, lower, upper, inverse=inverse_of(eye, lower | upper)), expected)
 
 
 def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
@@ -255,7 +261,7 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
     rng = np.random.default_rng(5)
     gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
     upper = rng.random((200, 2)) < 0.7
-    result = balance(gradient, rows, np.zeros_like(upper), upper, inverse=pseudo_inverses(rows, upper))
+    result = balance(gradient, rows, np.zeros_like(upper), upper, inverse=inverse_of(rows, upper))
     assert (result >= 0).all()
     assert (result[~upper] == 0).all()
     for k in range(200):
@@ -384,3 +390,36 @@ def test_the_loss_is_the_excess_cost_on_few_intervals(intervals: int) -> None:
 
         spent = solve_ivp(rate, (begin, end), spent, rtol=1e-11, atol=1e-14).y[:, -1]
     assert float(plan.audit().lost.sum()) == pytest.approx(spent[1] - least, rel=0.05)
+
+
+# ---- what the sweep does not decide ----------------------------------------------------------------------------------
+
+
+def swing(running: Callable[[Any], Any] = lambda u: u**2) -> tuple[Problem, Any]:
+    """A pendulum that swings to half a radian within a second."""
+    problem = Problem("swing")
+    angle = problem.state("angle", initial=0.0, terminal=0.5, lower=-2.0, upper=2.0)
+    rate = problem.state("rate", initial=0.0, lower=-5.0, upper=5.0)
+    torque = problem.control("torque", lower=-3.0, upper=3.0)
+    problem.dynamics(angle, rate)
+    problem.dynamics(rate, torque - ca.sin(angle))
+    problem.horizon(1.0)
+    problem.minimize(running(torque))
+    return problem, torque
+
+
+def test_a_control_in_a_condition_at_the_end_is_named() -> None:
+    problem, torque = swing()
+    problem.end("let go", torque, 0, 0)
+    audit = solve(problem, Collocation(10)).audit()
+    assert audit.feasible
+    assert audit.optimal is None
+    assert audit.undecided == "a control enters the conditions at an end"
+
+
+def test_no_plan_costs_less_than_a_lower_bound_of_the_cost() -> None:
+    """Torques up to 4 cost 1 a second, and there are none above 3: no plan is better, although nothing curves."""
+    problem, _ = swing(lambda u: 1 + ca.fmax(u - 4, 0))
+    audit = solve(problem, Collocation(10)).audit()
+    assert audit.passed
+    assert "global optimum" in audit["curvature downwards, relative"].note

@@ -35,7 +35,7 @@ from ocp.motion.builders.standing.start import (
 )
 from ocp.motion.tasks.checks import check_length, check_rest, checked_configuration, checked_tasks, rates_at_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.limits import Following, InFoot, JointBounds, Limits, Pinned, ZmpRule, check_rule, foot_rows
+from ocp.motion.tasks.limits import InFoot, JointBounds, Limits, Pinned, ZmpRule, check_rule, foot_rows
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
@@ -155,7 +155,7 @@ def standing_problem(
         horizon: Final time, s, or FreeTime(...).
         start: Start configuration. Shape (n,), rad or m.
         zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
-            Pinned(point), Following(reference) or Anywhere().
+            Pinned(point) or Anywhere().
         weights, limits: Weights of the parts of the cost; limits of joints and ground.
         setup: Both ends, external wrenches, control, formulation and clearance.
 
@@ -346,7 +346,7 @@ def _constrain_ground(
         problem.path("friction", reserve, lower=0)
     point = center_of_pressure(reaction)
     name = "zero moment point"
-    if isinstance(zmp, Pinned | Following):
+    if isinstance(zmp, Pinned):
         gap = ca.mtimes(ca.DM(machine.moving_directions), point - zmp.place(machine, problem.time))
         problem.path(name, gap, lower=0, upper=0, unit="m")
         name = "foot"

@@ -24,7 +24,7 @@ from ocp.errors import ProblemError
 from ocp.motion.local.accelerations import AccelerationOptions, resolve_accelerations
 from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.limits import Following, JointBounds, Pinned, ZmpRule, foot_edges
+from ocp.motion.tasks.limits import JointBounds, Pinned, ZmpRule, foot_edges
 from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import on_symbols
 
@@ -56,7 +56,7 @@ def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
     """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than the machine has."""
-    pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
+    pinned = len(machine.moving_directions) if isinstance(zmp, Pinned) else 0
     left = machine.joint_size - (size + pinned - along_parameter)
     follows = tip_level == "acceleration" and not pinned  # the joints come to rest with the tip
     if left < 0 or (left == 0 and ends_at_rest and not follows):
@@ -107,7 +107,7 @@ def check_loads(
     rows.append((reaction[5] / least_force, 1.0, np.inf, f"the vertical force, at least {least_force:g} N"))
     scale = machine.weight * machine.support.half_widths.max()
     normals, offsets = foot_edges(machine, zmp)
-    if isinstance(zmp, Pinned | Following):
+    if isinstance(zmp, Pinned):
         directions = machine.moving_directions
         place = directions @ np.array(ca.DM(zmp.place(machine, ca.DM(0.0)))).ravel()
         normals, offsets = np.vstack([normals, directions, -directions]), np.concatenate([offsets, place, -place])

@@ -16,7 +16,9 @@ from ocp import (
     Limits,
     Problem,
     ProblemError,
+    RateOptions,
     Solution,
+    Start,
     TipTask,
     VelocitySetup,
     minimum_velocity_problem,
@@ -43,9 +45,12 @@ def chain() -> FixedBase:
     return FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
 
 
-def resolved(machine: Machine, *, start: Any, **request: Any) -> LocalSolution:
+def resolved(
+    machine: Machine, *, start: Any, setup: VelocitySetup | None = None, weights: Any = None, **request: Any
+) -> LocalSolution:
     """The local motion under arguments of `minimum_velocity_problem`."""
-    return resolve(machine, start=start, **request)
+    begin = Start(start, None if setup is None else setup.start_base)
+    return resolve(machine, start=begin, options=RateOptions(weights=weights), **request)
 
 
 def audited(machine: Machine, method: Collocation, /, **request: Any) -> Solution:

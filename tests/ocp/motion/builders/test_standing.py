@@ -26,7 +26,7 @@ from ocp import (
 )
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, motion_cost, standing_problem
 from ocp.motion.local.accelerations import Stabiliser
-from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned
 from tests.families import some
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import numeric
@@ -218,7 +218,7 @@ def test_the_zero_moment_point_follows_a_reference() -> None:
     def reference(t: Any) -> list[Any]:
         return [0.0, 0.04 * ca.sin(t)]
 
-    solution = points(table_plan(1, Following(reference), tip_level="acceleration"), 30)
+    solution = points(table_plan(1, Pinned(reference), tip_level="acceleration"), 30)
     motion = sampled(machine(), solution)
     np.testing.assert_allclose(motion.zero_moment_point[:, 1], 0.04 * np.sin(motion.t), atol=MILLIMETRE)
 
@@ -228,7 +228,7 @@ def test_held_jerks_keep_the_zero_moment_point_at_its_place_between_the_points(a
     def reference(t: Any) -> list[Any]:
         return [0.0, amplitude * ca.sin(t)]
 
-    zmp: Any = Following(reference) if amplitude else Pinned()
+    zmp: Any = Pinned(reference) if amplitude else Pinned()
     motion = sampled(machine(), held(table_plan(1, zmp, control="jerk"), 80))
     np.testing.assert_allclose(motion.zero_moment_point[:, 1], amplitude * np.sin(motion.t), atol=MILLIMETRE)
     assert tip_error(machine(), motion, table_task(1)) < 1e-5
@@ -502,11 +502,11 @@ def test_a_standing_machine_yields_to_a_time_dependent_force() -> None:
         ({"zmp": "foot"}, "zmp must be InFoot, .* not 'foot'"),
         ({"zmp": InFoot(0.15)}, "margin 0.15 m is too large"),
         ({"limits": 3}, "limits must be a Limits, not "),
-        ({"zmp": Following(lambda t: t)}, "Following: the reference must be two numbers"),
+        ({"zmp": Pinned(lambda t: t)}, "Pinned: point must be two numbers"),
         ({"zmp": Pinned("here")}, "Pinned: point must be two numbers"),
         ({"end": np.deg2rad([140.0, 90, 240, 200, 50])}, "joints.*terminal.*2.44.*outside"),
         ({"zmp": Pinned((0.0,))}, "Pinned: point must be two numbers"),
-        ({"zmp": Following(lambda t: [t])}, "Following: the reference must be two numbers"),
+        ({"zmp": Pinned(lambda t: [t])}, "Pinned: point must be two numbers"),
         ({"limits": Limits(velocity=(1.0, 2.0))}, "velocity has shape .* one for each of the 5 joints"),
         ({"horizon": 1.0}, "the task of .* moves at .* 1 s, where the joints are to be at rest"),
     ],

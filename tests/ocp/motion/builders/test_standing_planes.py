@@ -14,7 +14,7 @@ from models.paths import rest_to_rest
 from ocp import AccelerationOptions, Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.local.accelerations import Law
-from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
+from ocp.motion.tasks.limits import Anywhere, IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
 from tests.models.machines.standing_machines import planar_machine
 from tests.models.robot.trees import Array, numeric
 from tests.ocp.motion.builders.standing_tasks import (
@@ -145,10 +145,10 @@ def test_a_foot_beside_the_machine_is_refused(start: Any, zmp: ZmpRule) -> None:
     ("zmp", "message"),
     [
         (Pinned((0.0, 0.3)), r"Pinned: \[0.0, 0.3\] m at 0 s is 0.1 m outside the support"),
-        (Following(lambda t: [0.0, -0.02 * t * t]), None),
-        (Following(lambda t: [0.0, 0.15 * t]), r"Following: .* at 1.34 s is 0.001 m outside the support"),
-        (Following(lambda t: [0.0, np.nan]), "Following: the reference must be two numbers"),
-        (Following(lambda t: [0.0, (t - 1) ** 0.5]), "Following: the reference must be two numbers"),
+        (Pinned(lambda t: [0.0, -0.02 * t * t]), None),
+        (Pinned(lambda t: [0.0, 0.15 * t]), r"Pinned: .* at 1.34 s is 0.001 m outside the support"),
+        (Pinned(lambda t: [0.0, np.nan]), "Pinned: point must be two numbers"),
+        (Pinned(lambda t: [0.0, (t - 1) ** 0.5]), "Pinned: point must be two numbers"),
     ],
 )
 def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str | None) -> None:

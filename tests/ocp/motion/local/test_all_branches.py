@@ -17,7 +17,7 @@ from models.checks import Array
 from ocp import IkOptions, ProblemError, TipTask, inverse_kinematics
 from ocp.motion.local.chain import Chain, Motion
 from ocp.motion.local.elimination import Elimination, elimination_of, solve_opening
-from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ToolFreedom, ik_configurations
+from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ik_configurations
 from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
 from tests.families import some
@@ -239,23 +239,22 @@ def test_slides_are_sampled_rather_than_six_joints_left_without_closed_form() ->
     assert len(IkSolver(on_rail(crx(3.0), 2)).parameters) == 2
     assert IkSolver(ur5()).parameters == ()
     assert len(IkSolver(panda()).parameters) == 1
-    assert IkSolver(ur5(), free=ToolFreedom.ROLL).parameters == ("roll",)
+    position, rotation = tip_poses(ur5(), np.full((1, 6), 0.3))
+    assert ik_configurations(ur5(), TipTask(position=position[0], direction=rotation[0, :, 2])).parameters == ("roll",)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 7])
 def test_a_position_alone_is_reached_by_arms_of_three_joints_and_more(count: int) -> None:
     machine, rng = random_arm(np.random.default_rng(count), count), np.random.default_rng(11)
     joints = rng.uniform(-np.pi, np.pi, (5, count))
-    positions, rotations = tip_poses(machine, joints)
-    solver = IkSolver(machine, free=ToolFreedom.ROTATION, samples=20)
-    result = solver(positions, rotations)
-    assert len(solver.parameters) == count - 3
-    np.testing.assert_allclose(tip_poses(machine, result.joints)[0], positions[result.pose], atol=1e-9)
+    positions, _ = tip_poses(machine, joints)
     for k in range(5):
+        result = ik_configurations(machine, TipTask(position=positions[k]), samples=20)
+        assert len(result.parameters) == count - 3
+        np.testing.assert_allclose(tip_poses(machine, result.joints)[0] - positions[k], 0, atol=1e-9)
         if count == 3:
-            assert distances(joints[k : k + 1], result.at(k), revolute(machine)).min() < 1e-6
-        task = TipTask(position=positions[k])
-        assert count > 6 or len(ik_configurations(machine, task, samples=20))
+            assert distances(joints[k : k + 1], result.joints, revolute(machine)).min() < 1e-6
+        assert count > 6 or len(result)
 
 
 @pytest.mark.parametrize("count", [4, 5, 6, 7])
@@ -326,13 +325,8 @@ def test_poses_that_are_none_are_refused() -> None:
     ):
         with pytest.raises(ProblemError):
             solver(positions, rotations)
-    options: list[dict[str, Any]] = [
-        {"samples": 0},
-        {"tool_axis": (0, 0, 0)},
-        {"free": ToolFreedom.CONE},
-        {"link": "no"},
-    ]
-    for option in [*options, {"free": "roll"}, {"limits": 1}]:
+    options: list[dict[str, Any]] = [{"samples": 0}, {"limits": 1}]
+    for option in options:
         with pytest.raises(ProblemError):
             IkSolver(ur5(), **option)
     with pytest.raises(ProblemError):

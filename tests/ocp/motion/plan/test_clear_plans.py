@@ -41,7 +41,6 @@ from ocp import (
     inverse_kinematics,
     minimum_velocity_problem,
     plan,
-    resolve,
     solve,
 )
 from ocp.motion.local.collisions import distances_along
@@ -384,17 +383,6 @@ def test_colliding_configurations_are_omitted_or_named() -> None:
     with pytest.raises(Unreachable, match=r"is in collision.*link6 and obstacle 0 overlap") as caught:
         inverse_kinematics(ARM, at, scene=CollisionScene(ARM, [Sphere(0.2, FIRST)]))
     assert caught.value.name == "link6 and obstacle 0"
-
-
-def test_a_local_motion_tells_how_near_it_comes() -> None:
-    around = CollisionScene(ARM, [POST])
-    local = resolve(ARM, line(), SECONDS, start=START, samples=101, scene=around)
-    report = distances_along(around, np.zeros(0), local.joints, local.t)
-    assert_allclose(local.clearance, report.min(axis=1))
-    worst = int(local.clearance.argmin())
-    assert local.clearance[worst] < 0
-    assert local.nearest[worst] == ("link6", "obstacle 0")
-    assert np.isnan(resolve(ARM, line(), SECONDS, start=START, samples=11).clearance).all()
 
 
 @pytest.mark.long
