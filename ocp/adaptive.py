@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 from ocp.console import interruptible, report, shown_progress, time_left, time_limited
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.direct.guess import guessed_names
-from ocp.direct.prepared import DirectMethod, Prepared
+from ocp.direct.prepared import DirectMethod
 from ocp.errors import RefinementWarning, SolveError, checked_time_limit, require
 from ocp.methods import descend
 from ocp.problem.formulation import Formulation
@@ -178,7 +179,9 @@ class AdaptiveProblem:
                 continue
             ends.append(f"{_label(mesh)} from the {start}: {plan.status} after {plan.iterations} iterations")
             if plan.success:
-                plans.append(_descended(prepared, plan))
+                with suppress(SolveError):  # a saddle point without a lower plan beside it is kept
+                    plan = descend(prepared, plan)
+                plans.append(plan)
             elif time_left() <= 0:
                 break
         return plans
@@ -200,11 +203,3 @@ class AdaptiveProblem:
 
 def _label(mesh: DirectMethod) -> str:
     return f"{type(mesh).__name__}({mesh.intervals})"
-
-
-def _descended(prepared: Prepared, plan: Solution) -> Solution:
-    """Return a nearby plan of lower cost if the given plan is a saddle point, else the given plan."""
-    try:
-        return descend(prepared, plan) if plan.regularised else plan
-    except SolveError:
-        return plan
