@@ -18,7 +18,7 @@ from typing import Any
 from ocp.console import interruptible, report, shown_progress, time_left, time_limited
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.direct.guess import guessed_names
-from ocp.direct.prepared import DirectMethod
+from ocp.direct.prepared import DirectMethod, Prepared
 from ocp.errors import RefinementWarning, SolveError, checked_time_limit, require
 from ocp.methods import descend
 from ocp.problem.formulation import Formulation
@@ -133,12 +133,14 @@ class AdaptiveProblem:
                 warnings.warn(RefinementWarning("\n".join([words, *ends]), name="accuracy"), stacklevel=2)
                 return best
             mesh = Collocation(20)
-            prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
             try:  # with all starts, and a report of conflicting constraints
-                plan = prepared.solve(parameters, guess)
+                plan = self._prepared(mesh).solve(parameters, guess)
             except SolveError as error:
                 raise self._failure(error, guess, ends) from error
             return self._refined(mesh, plan, parameters)
+
+    def _prepared(self, mesh: DirectMethod) -> Prepared:
+        return mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
         """Solve by collocation on finer and finer meshes, starting from a plan; return the plan on the last mesh."""
@@ -165,7 +167,11 @@ class AdaptiveProblem:
 
         ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
         """
-        prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
+        try:
+            prepared = self._prepared(mesh)
+        except SolveError as error:  # the time ran out during the build; plans of coarser meshes remain
+            ends.append(f"{_label(mesh)}: {str(error).splitlines()[0]}")
+            return []
         starts: list[tuple[str, Guess]] = [(start, guesses[0]) for start in FIRST_STARTS]
         if guesses[1] is not None:
             starts = [("guess", guesses[1]), *starts]
