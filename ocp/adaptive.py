@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -132,12 +133,14 @@ class AdaptiveProblem:
                 warnings.warn(RefinementWarning("\n".join([words, *ends]), name="accuracy"), stacklevel=2)
                 return best
             mesh = Collocation(20)
-            prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
             try:  # with all starts, and a report of conflicting constraints
-                plan = prepared.solve(parameters, guess)
+                plan = self._prepared(mesh).solve(parameters, guess)
             except SolveError as error:
                 raise self._failure(error, guess, ends) from error
             return self._refined(mesh, plan, parameters)
+
+    def _prepared(self, mesh: DirectMethod) -> Prepared:
+        return mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
 
     def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
         """Solve by collocation on finer and finer meshes, starting from a plan; return the plan on the last mesh."""
@@ -164,7 +167,11 @@ class AdaptiveProblem:
 
         ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
         """
-        prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
+        try:
+            prepared = self._prepared(mesh)
+        except SolveError as error:  # the time ran out during the build; plans of coarser meshes remain
+            ends.append(f"{_label(mesh)}: {str(error).splitlines()[0]}")
+            return []
         starts: list[tuple[str, Guess]] = [(start, guesses[0]) for start in FIRST_STARTS]
         if guesses[1] is not None:
             starts = [("guess", guesses[1]), *starts]
@@ -178,7 +185,9 @@ class AdaptiveProblem:
                 continue
             ends.append(f"{_label(mesh)} from the {start}: {plan.status} after {plan.iterations} iterations")
             if plan.success:
-                plans.append(_descended(prepared, plan))
+                with suppress(SolveError):  # a saddle point without a lower plan beside it is kept
+                    plan = descend(prepared, plan)
+                plans.append(plan)
             elif time_left() <= 0:
                 break
         return plans
@@ -200,11 +209,3 @@ class AdaptiveProblem:
 
 def _label(mesh: DirectMethod) -> str:
     return f"{type(mesh).__name__}({mesh.intervals})"
-
-
-def _descended(prepared: Prepared, plan: Solution) -> Solution:
-    """Return a nearby plan of lower cost if the given plan is a saddle point, else the given plan."""
-    try:
-        return descend(prepared, plan) if plan.regularised else plan
-    except SolveError:
-        return plan

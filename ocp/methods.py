@@ -163,7 +163,7 @@ def solve(
         chosen = call_registered("default_method") if method is None else method
         prepared = prepare(problem, chosen, solver=solver, options=options)
         solution = prepared.solve(parameters, guess, check)
-        return descend(prepared, solution) if check and solution.regularised else solution
+        return descend(prepared, solution) if check else solution
 
 
 def descend(prepared: PreparedProblem, solution: Solution) -> Solution:

@@ -28,7 +28,6 @@ from ocp.tolerances import RESOLVED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
 INTEGRATION = "integration error, relative"
-KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 
 @dataclass(frozen=True)
@@ -159,21 +158,17 @@ def _refine_mesh(
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
     intervals: list[int] = []
-    errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    errors: dict[str, list[float]] = {kind: [] for kind in ("integration", "equalities", "limits", "cost", "other")}
     progress, late, placed = _Progress(settings.nearer), False, np.zeros(0)
     moving = isinstance(method, Collocation) and method.control == "points"
     driven = _limits_of_controls(form, solution)
 
-    def assess() -> tuple[list[_Row], list[_Row]]:
-        """Record the errors of the last plan. Return all of these errors, and the errors that exceed their limits."""
+    while True:
         rows = _rows(form, p, solution, audit, tolerance, method)
+        beyond = [row for row in rows if not row.value <= 1.0]
         intervals.append(method.intervals)
         for kind, values in errors.items():
             values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
-        return rows, [row for row in rows if not row.value <= 1.0]
-
-    while True:
-        rows, beyond = assess()
         progress.record({row.name: row.unresolved(np.diff(method.fractions)) for row in beyond})
         idle = min(progress.vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
@@ -332,24 +327,13 @@ class _Row(NamedTuple):
         return float(widths[beyond] @ self.errors[beyond])
 
 
-class _Parts(NamedTuple):
-    """Contributions of the mesh intervals to an error that the audit reports; the error is their sum or maximum.
-
-    ``values`` (N,) are in any unit.
-    """
-
-    kind: str
-    values: np.ndarray
-    order: int
-    summed: bool = False
-
-    def shares(self, total: float) -> np.ndarray:
-        """Scale the contributions (N,) so that their maximum, or mean if they add up, equals the error ``total``."""
-        values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
-        reference = values.mean() if self.summed else values.max()
-        result = np.zeros(len(values))
-        result[values > 0] = total * (values[values > 0] / (reference or 1.0))
-        return result
+def _shares(values: np.ndarray, total: float, summed: bool) -> np.ndarray:
+    """Scale contributions (N,) so that their maximum, or mean if they are ``summed``, equals the error ``total``."""
+    values = values if np.isfinite(values).all() else np.where(np.isfinite(values), 0.0, 1.0)
+    reference = values.mean() if summed else values.max()
+    result = np.zeros(len(values))
+    result[values > 0] = total * (values[values > 0] / (reference or 1.0))
+    return result
 
 
 def _rows(
@@ -359,20 +343,19 @@ def _rows(
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)
-    order = method.control_order
-    parts = {
-        name: _Parts("integration", audit.local_errors, method.order)
-        for name in (requested.name, INTEGRATION, "integration error of one interval")
-    }
+    order, costates = method.control_order, audit.optimality.adjoint
     grows = audit.integration_error > CORRECTION.growth * float(audit.local_errors.sum())
-    if grows:
-        parts[INTEGRATION] = _Parts("integration", audit.local_errors, method.order, summed=True)
-    parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
-    costates = audit.optimality.adjoint
-    parts["costate equation, relative"] = _Parts("other", costates.error, order, summed=True)
-    parts["costates between the nodes, relative"] = _Parts("other", costates.between, order)
+    # kind of each error, contributions of the intervals in any unit, order, and whether the contributions add up
+    parts: dict[str, tuple[str, np.ndarray, int, bool]] = {
+        requested.name: ("integration", audit.local_errors, method.order, False),
+        INTEGRATION: ("integration", audit.local_errors, method.order, grows),
+        "integration error of one interval": ("integration", audit.local_errors, method.order, False),
+        "cost lost, relative": ("cost", audit.lost, 2 * order, True),
+        "costate equation, relative": ("other", costates.error, order, True),
+        "costates between the nodes, relative": ("other", costates.between, order, False),
+    }
     for name, (equal, misses) in _violations(form, p, solution, audit).items():
-        parts[name] = _Parts("equalities" if equal else "limits", misses, order)
+        parts[name] = ("equalities" if equal else "limits", misses, order, False)
     rows = []
     for finding in (requested, *audit.findings):
         if finding.limit is None or finding.name in form.separations:  # refinement does not separate bodies
@@ -382,11 +365,11 @@ def _rows(
             # no mesh reduces the growth: the audit requires that the sum of the defects is below a share of the limit
             value = CORRECTION.growth * float(audit.local_errors.sum()) / finding.limit
         value = np.inf if np.isnan(value) else float(value)
-        part = parts.get(finding.name)
-        if part is None or not part.values.any():
-            rows.append(_Row(finding.name, "other", value))
+        kind, errors, power, summed = parts.get(finding.name, ("other", np.zeros(0), 1, False))
+        if errors.any():
+            rows.append(_Row(finding.name, kind, value, _shares(errors, value, summed), power, grows))
         else:
-            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order, grows))
+            rows.append(_Row(finding.name, "other", value))
     return rows
 
 

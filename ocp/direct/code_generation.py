@@ -235,8 +235,8 @@ def warn_interpreted(reason: str) -> None:
     LOG.warning("functions are interpreted, which is slower: %s", reason)
 
 
-def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
-    """Return the casadi Functions that are exported to C for a controller, in the units of the problem.
+def problem_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
+    """Return the casadi Functions of a problem that are exported to C, in the units of the problem.
 
     Args:
         guess: Variables that `plan_guess` clips to the bounds at its parameters. Shape (size,).
@@ -270,10 +270,10 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
     ]
 
 
-def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write a problem's C files for a controller to a folder, and return the folder; errors are those of `write_c`."""
+def write_problem(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
+    """Write the C files of a problem to a folder, and return the folder; errors are those of `write_c`."""
     texts = {"curves.h": CURVES, "problem.h": problem_header(form, transcription), "main.c": MAIN, "Makefile": MAKEFILE}
-    return write_c(form, controller_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
+    return write_c(form, problem_functions(form, transcription, guess), "plan", folder=folder, texts=texts)
 
 
 def write_c(form: Formulation, functions: list[Any], name: str, *, folder: Path, texts: dict[str, str]) -> Path:

@@ -35,7 +35,8 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
         ProblemError: An unknown name, a wrong size, or a number that is not finite.
     """
     guesses = dict(form.guesses)
-    horizon = default_horizon(form, bounds)
+    low, high = (side[form.bounds.places["horizon"][0]] for side in bounds)
+    horizon = middle_horizon(low, high) if form.horizon_guess is None else float(np.clip(form.horizon_guess, low, high))
     values: dict[str, Any] = {}
     curves: dict[str, Trajectory] = {}
     if isinstance(guess, Solution):
@@ -196,15 +197,6 @@ def broadcast_guess(name: str, value: Any, size: int) -> np.ndarray:
         words = f"guess of {name!r} has {array.size} entries, {size} expected"
         raise ProblemError(words, name=name, value=array.size, limit=size)
     return np.broadcast_to(array, size)
-
-
-def default_horizon(form: Formulation, bounds: Bounds) -> float:
-    """Return the horizon at which a solve starts: the declared guess, clipped to the bounds, or a default value."""
-    place = form.bounds.places["horizon"][0]
-    low, high = bounds[0][place], bounds[1][place]
-    if form.horizon_guess is not None:
-        return float(np.clip(form.horizon_guess, low, high))
-    return middle_horizon(low, high)
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:

@@ -17,7 +17,7 @@ import numpy as np
 from ocp.console import TimeLimitReached, check_time, interruptible, time_limited
 from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
-from ocp.direct.code_generation import block_derivatives, write_controller
+from ocp.direct.code_generation import block_derivatives, write_problem
 from ocp.direct.controller import Controller, ControllerSettings
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
 from ocp.direct.guess import STARTS, alternative_starts, displace, guessed_names, initial_point, shifted_indices
@@ -186,7 +186,7 @@ class Prepared:
             if isinstance(guess, Solution) and guess.method == self.method.settings:
                 # on this grid; a staged layout has more variables than a plain one
                 point = guess.variables if guess.variables.size == point.size else point
-            return write_controller(form, transcription, point, place)
+            return write_problem(form, transcription, point, place)
 
     def controller(
         self,

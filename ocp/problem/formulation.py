@@ -96,7 +96,6 @@ class BoundTable:
 
     @cached_property
     def _pullback(self) -> Any:
-        """CasADi Function of the transposed Jacobian of the bounds times multipliers; see :meth:`pullback`."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)

@@ -354,7 +354,7 @@ def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, 
 
 
 def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
-    """Rebuild a problem from its record like `from_record`, but raise various errors if the record is damaged."""
+    """Rebuild a problem from its record; raise any of `RECORD_ERRORS` if the record is damaged."""
     symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
     expressions = functions[record["expressions"]]
     time = symbols.sym("time")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Never
 
 import numpy as np
 import pytest
 
+import ocp.adaptive
 from ocp import AdaptiveCollocation, Collocation, Problem, ProblemError, SolveError, prepare, solve
 from tests.conformance.suite import bryson_max_range
 from tests.ocp.direct.test_without_guess import reorientation
@@ -55,6 +57,24 @@ def test_the_guess_parameters_and_progress_are_passed_on() -> None:
         solution = prepared.solve({"goal": value}, {"x": lambda t, value=value: value * t})
         assert solution.cost == pytest.approx(value**2, rel=1e-8)
     assert len(stages) >= 6
+
+
+class UnbuiltCollocation(Collocation):
+    """A mesh whose program is not built within the time limit."""
+
+    def prepare(self, problem: Problem, **_: object) -> Never:
+        raise SolveError(f"problem {problem.name!r} was still being built")
+
+
+def test_the_plan_of_a_coarse_mesh_survives_a_finer_one_that_is_not_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ocp.adaptive, "FIRST_MESHES", (Collocation(12), UnbuiltCollocation(20)))
+    monkeypatch.setattr(ocp.adaptive, "FIRST_STARTS", ("guess",))
+    problem, x, u = plant("near", initial=0.0, terminal=1.0)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2)
+    solution = solve(problem)
+    assert solution.success
+    assert solution.cost == pytest.approx(1.0 / solution.horizon, rel=1e-6)
 
 
 def test_the_error_without_a_plan_names_the_conflict_and_what_has_no_guess() -> None:
