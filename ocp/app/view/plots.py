@@ -8,7 +8,8 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from itertools import chain
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -25,7 +26,6 @@ from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.result.plan import Plan
 from ocp.motion.schedule.trajectory import JointTrajectory
-from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
@@ -37,35 +37,46 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
 
 
-def draw_joints(
-    figure: Any, motions: Mapping[str, Motion], bounds: JointBounds, *, names: Sequence[str], units: Sequence[str]
-) -> None:
-    """Draw position, velocity and acceleration of every joint over time into an empty figure, with their limits.
+class Diagram(NamedTuple):
+    """A diagram of a figure.
 
-    The first of several motions is the plan; the others are compared with it.
+    Attributes:
+        title, label: Title, and label of the vertical axis.
+        curves: For each curve the number of its motion, and its times and values. Shape (M,) each.
+        lower, upper: Limits of the quantity, infinite if there are none.
+        min_range: Curves with a smaller range are drawn as constant.
+    """
+
+    title: str
+    label: str
+    curves: Sequence[tuple[int, Array, Array]]
+    lower: float
+    upper: float
+    min_range: float
+
+
+def draw_diagrams(figure: Any, diagrams: Sequence[Diagram], columns: int, names: Sequence[str]) -> None:
+    """Draw diagrams over time, row by row, into an empty figure.
+
+    `names` are those of the motions; the first one is the plan, and the others are compared with it.
     """
     with matplotlib.rc_context(STYLE):
-        grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
-        for column, (kind, per) in enumerate(KINDS.items()):
-            samples = [
-                (number, *curve_samples(motion, kind))
-                for number, motion in reversed([*enumerate(motions.values())])  # the plan last, on top
-            ]
-            lower, upper = bounds_of(bounds, kind)
-            sizes = [np.abs(values).max() for _, _, values in samples if values is not None]
-            grid[0, column].set_title(kind)
-            for row, name in enumerate(names):
-                ax = grid[row, column]
-                for number, times, values in samples:
-                    if values is not None:
-                        ax.plot(times, values[:, row], **line_style(number))
-                draw_limits(ax, lower[row], upper[row], PICTURE_STYLE.flat * max(sizes, default=1.0))
-                ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
-                ax.margins(x=0.01)
-        for ax in grid[-1]:
+        grid = figure.subplots(-(-len(diagrams) // columns), columns, squeeze=False, sharex=True).ravel()
+        for ax in grid[len(diagrams) :]:
+            ax.remove()
+        for ax, diagram in zip(grid, diagrams, strict=False):
+            for number, times, values in reversed(diagram.curves):  # the plan last, on top
+                ax.plot(times, values, **line_style(number))
+            draw_limits(ax, diagram.lower, diagram.upper, diagram.min_range)
+            ax.set_title(diagram.title)
+            ax.set_ylabel(diagram.label, fontsize=7)
+            ax.margins(x=0.01)
+        for ax in grid[max(0, len(diagrams) - columns) : len(diagrams)]:
             ax.set_xlabel("time, s")
-        if len(motions) > 1:
-            add_legend(figure, list(motions))
+            ax.tick_params(labelbottom=True)
+        if len(names) > 1:
+            lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
+            figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
@@ -82,12 +93,6 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 def line_style(number: int) -> dict[str, Any]:
     """Return the line style of a plan (number 0), or of a motion compared with the plan (number 1, 2, ...)."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
-
-
-def add_legend(figure: Any, names: Sequence[str]) -> None:
-    """Add a legend below a figure, with the names of the plan and of the motions compared with the plan."""
-    lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
-    figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 
 def as_svg(figure: Any) -> str:
@@ -123,10 +128,21 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     """
     names = plan.names
     others = {name: _comparison(name, motion, names) for name, motion in _motions_by_name(against).items()}
-    motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
+    motions = [_motion_of(plan), *(motion for motion, _ in others.values())]
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
-    draw_joints(target, motions, plan.joint_bounds, names=names, units=[joint.unit for joint in robot.moving_joints])
+    columns: list[list[Diagram]] = []
+    for kind, per in KINDS.items():
+        samples = [(number, *curve_samples(motion, kind)) for number, motion in enumerate(motions)]
+        known = [(number, times, values) for number, times, values in samples if values is not None]
+        min_range = PICTURE_STYLE.flat * max((np.abs(values).max() for _, _, values in known), default=1.0)
+        lower, upper = bounds_of(plan.joint_bounds, kind)
+        columns.append([])
+        for k, joint in enumerate(robot.moving_joints):
+            curves = [(number, times, values[:, k]) for number, times, values in known]
+            title, name = "" if k else kind, "" if per else joint.name
+            columns[-1].append(Diagram(title, f"{name}\n{joint.unit}{per}", curves, lower[k], upper[k], min_range))
+    draw_diagrams(target, list(chain(*zip(*columns, strict=True))), len(columns), ["plan", *others])
     costs = "".join(f", that of {name} {cost:.4g}" for name, (_, cost) in others.items() if cost is not None)
     target.suptitle(f"{robot.name}: cost {plan.cost:.4g} in {plan.horizon:.4g} s{costs}", fontsize=9.5)
     return target
@@ -190,9 +206,9 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         ProblemError: A motion cannot be compared, or has other states and controls.
     """
     others = _motions_by_name(against)
-    own_widths = _widths(solution.name, solution)
-    for name, other in others.items():
-        widths = _widths(name, other)
+    curves = [_curves_over_time(name, motion) for name, motion in ((solution.name, solution), *others.items())]
+    own_widths, *all_widths = ({name: samples.shape[1] for name, (_, samples) in each.items()} for each in curves)
+    for (name, other), widths in zip(others.items(), all_widths, strict=True):
         expected = {name: own_widths.get(name) for name in (widths if isinstance(other, LocalSolution) else own_widths)}
         if widths != expected:
             words = f"plot: {name!r} has {widths}, the solution has {own_widths}"
@@ -200,29 +216,17 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
     entries = [(name, k) for name, width in own_widths.items() for k in range(width)]
     omitted, entries = entries[PICTURE_STYLE.entries :], entries[: PICTURE_STYLE.entries]
     bounds, units = _bounds(solution)
-    rows = -(-len(entries) // PICTURE_STYLE.columns)
-    target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
-    with matplotlib.rc_context(STYLE):
-        grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
-        for ax in grid.ravel()[len(entries) :]:
-            ax.remove()
-        curves = [_curves_over_time(motion) for motion in (solution, *others.values())]
-        for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
-            for number, curve in reversed([*enumerate(curves)]):
-                if name in curve:
-                    times, values = curve[name]
-                    ax.plot(times, values[:, k], **line_style(number))
-            lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
-            largest = max(np.abs(curve[name][1]).max() for curve in curves if name in curve)
-            draw_limits(ax, lower, upper, PICTURE_STYLE.flat * largest)
-            ax.set_title(name if own_widths[name] == 1 else f"{name} [{k}]")
-            ax.set_ylabel(units.get(name, ""), fontsize=7)
-            ax.margins(x=0.01)
-        for ax in grid.ravel()[max(0, len(entries) - grid.shape[1]) : len(entries)]:
-            ax.set_xlabel("time, s")
-            ax.tick_params(labelbottom=True)
-        if others:
-            add_legend(target, ["solution", *others])
+    diagrams = []
+    for name, k in entries:
+        known = [(number, *curve[name]) for number, curve in enumerate(curves) if name in curve]
+        min_range = PICTURE_STYLE.flat * max(np.abs(values).max() for _, _, values in known)
+        lower, upper = bounds[name][:, k] if name in bounds else (-np.inf, np.inf)
+        title = name if own_widths[name] == 1 else f"{name} [{k}]"
+        lines = [(number, times, values[:, k]) for number, times, values in known]
+        diagrams.append(Diagram(title, units.get(name, ""), lines, lower, upper, min_range))
+    columns = min(PICTURE_STYLE.columns, len(entries))
+    target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * -(-len(entries) // columns)))
+    draw_diagrams(target, diagrams, columns, ["solution", *others])
     costs = "".join(f", that of {name} {np.ravel(other.cost)[-1]:.6g}" for name, other in others.items())
     rest = f"; {len(omitted)} entries are omitted" if omitted else ""
     target.suptitle(f"{solution.name}: cost {solution.cost:.6g}{costs}{rest}", fontsize=9.5)
@@ -236,26 +240,17 @@ def html_of_solution(solution: Solution) -> str:
     return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
 
 
-def _widths(name: str, motion: Any) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution or a local motion, keyed by name."""
+def _curves_over_time(name: str, motion: Any) -> dict[str, tuple[Array, Array]]:
+    """Return times, s, and values of each state and control by name, with both one-sided values at jumps.
+
+    The base, joints and rates of a local (resolved-rate) motion have the names that they have in a solution.
+    """
     if isinstance(motion, LocalSolution):
-        return {entry: values.shape[1] for entry, values in _local(motion).items()}
+        samples = {"base": motion.base, "joints": motion.joints, "rates": motion.joint_rates}
+        return {name: (motion.t, values) for name, values in samples.items() if values.shape[1]}
     if not isinstance(motion, Solution):
         words = f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result "
         raise ProblemError(f"{words}of resolve", name="against", value=motion)
-    return {entry: values.shape[1] for entry, values in {**motion.states, **motion.controls}.items()}
-
-
-def _local(other: LocalSolution) -> dict[str, Array]:
-    """Return base, joints and rates of a local (resolved-rate) motion, named as in a solution."""
-    samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
-    return {name: values for name, values in samples.items() if values.shape[1]}
-
-
-def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times, s, and values of each state and control by name, with both one-sided values at jumps."""
-    if isinstance(motion, LocalSolution):
-        return {name: (motion.t, values) for name, values in _local(motion).items()}
     nodes = motion.control_interpolant.breaks[1:-1]
     uniform = np.linspace(0.0, 1.0, PICTURE_STYLE.curve_points + 1)
     fractions = np.unique(np.concatenate([uniform, nodes - ROUNDING_SHARE, nodes + ROUNDING_SHARE]))
