@@ -159,6 +159,11 @@ def test_everything_that_moves_the_same_joints_is_compared() -> None:
         assert len(curves(ax, COMPARED)) == len(others)
 
 
+def test_a_compared_motion_may_have_the_name_of_the_plan() -> None:
+    first = motion().plot({"plan": local()}).axes[0]
+    assert len(curves(first, PLAN)) == len(curves(first, COMPARED)) == 1
+
+
 def test_a_plan_is_drawn_into_a_passed_figure() -> None:
     mine = Figure()
     assert motion().plot(figure=mine) is mine
