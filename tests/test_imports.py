@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import pytest
 
+pytestmark = pytest.mark.xdist_group("imports")  # the source is read once
 ROOT = Path(__file__).resolve().parent.parent
 Rule: TypeAlias = Callable[["Architecture"], list[str]]
 

@@ -451,7 +451,7 @@ def test_the_least_of_a_quadratic_in_a_box_is_that_of_a_fine_grid(free: int) -> 
     assert least == pytest.approx((place * (slope + np.einsum("pab,pb->pa", square, place) / 2)).sum(axis=1))
 
 
-@pytest.mark.parametrize("kind", [PathLength, LargestMotion])
+@pytest.mark.parametrize("kind", [pytest.param(PathLength, marks=pytest.mark.long), LargestMotion])
 @pytest.mark.parametrize("seed", some(range(6), 1))
 def test_bounds_of_lengths_with_two_free_directions_are_below_brute_force(seed: int, kind: Any) -> None:
     """Beside a grid over the first two of four joints; what memory allows is a bound already."""
