@@ -49,6 +49,9 @@ MARGIN_M = 1e-6
 class ProofSettings:
     """Limits of the computing effort to prove that a pair of bodies need not be checked for collision."""
 
+    configurations: int = (
+        1000  # random configurations; bodies that collide in all of them are assumed to collide always
+    )
     first_configurations: int = 24  # random configurations that are tried before a proof
     boxes: int = 2000  # boxes of joint positions that a proof may use with up to three joints between the bodies
     rounds: int = 40  # bisections of the boxes
@@ -83,8 +86,6 @@ def checked_pairs(
     srdf: str | os.PathLike[str] | None = None,
     limits: tuple[ArrayInput, ArrayInput] | None = None,
     clearance: float = 0.0,
-    seed: int = 0,
-    samples: int = 1000,
 ) -> Pairs:
     """Return the pairs of a robot's bodies to check for collision: those that can collide but do not always collide.
 
@@ -106,8 +107,6 @@ def checked_pairs(
         limits: Lower and upper limits of the joint vector, rad or m, each a number or of shape (dof,); the robot's own
             if None.
         clearance: Pairs that may come this close are checked, m.
-        seed: Seed of the random configurations.
-        samples: Number of random configurations.
 
     Raises:
         ModelError: A link is unknown (names similar ones), a body, limit or number is invalid, or the SRDF file cannot
@@ -132,18 +131,17 @@ def checked_pairs(
         k = int(np.flatnonzero(low > high)[0])
         message = f"{owner}: lower {low[k]} of joint {robot.joint_names[k]!r} is above upper {high[k]}"
         raise ModelError(message, name="lower", value=float(low[k]), limit=float(high[k]))
-    count = require.count(f"{owner}: samples", samples)
     margin = require.nonnegative(f"{owner}: clearance", clearance, unit="m") + MARGIN_M
-    rng = np.random.default_rng(require.count(f"{owner}: seed", seed, least=0, most=2**63))
     named = dict.fromkeys([] if srdf is None else _disabled_pairs(robot, srdf), SRDF)
     named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
-    key = _key(robot, bodies, named, low, high, margin, count, seed)
+    key = _key(robot, bodies, named, low, high, margin)
     if (known := _read(load_value(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
     adjacent = parts.adjacent({parts.of_link[body.link] for body in bodies})
-    classifier = _PairClassifier(robot, parts, low, high, _random_configurations(robot, low, high, count, rng), margin)
+    configurations = _random_configurations(robot, low, high, SETTINGS.configurations, np.random.default_rng(0))
+    classifier = _PairClassifier(robot, parts, low, high, configurations, margin)
     checked: list[tuple[int, int]] = []
     excluded: dict[tuple[str, str], Reason] = {}
     for i, j in combinations(range(len(bodies)), 2):
