@@ -117,10 +117,11 @@ def stack(kind: Any, records: Sequence[Any]) -> Expression:
 
 def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
     """Return the columns of a matrix as named tuples of one class; this is the inverse of `stack`."""
-    return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
+    return [_record(kind, column) for column in ca.horzsplit(matrix)]
 
 
 def _record(kind: Callable[..., _Record], column: Expression) -> _Record:
+    """Return one column of a result of `stack` as a named tuple."""
     return kind(*ca.vertsplit(column))
 
 

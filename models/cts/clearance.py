@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.checks import require
+from models.checks import require, set_fields
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, configuration_at, dh_frames, joints_of
 from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
@@ -100,7 +100,7 @@ class CollisionScene:
         if self.walls is not None:
             require.instance("scene: walls", self.walls, Box)
         for name, kind in (("solids", Box), ("capsules", Capsule)):
-            object.__setattr__(self, name, require.each(f"scene: {name}", getattr(self, name), kind))
+            set_fields(self, **{name: require.each(f"scene: {name}", getattr(self, name), kind)})
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
