@@ -32,7 +32,7 @@ from ocp.errors import (
 from ocp.indirect.method import Indirect
 from ocp.methods import Certificate, certificate, prepare, solve
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.cts import RollObstacles, RollSettings, roll_problem, spline_targets
+from ocp.motion.builders.cts import RollSettings, roll_problem, spline_targets
 from ocp.motion.builders.dynamics import DynamicsSetup, JointFriction, dynamics_problem, joint_torques
 from ocp.motion.builders.dynamics_plan import dynamics_phases
 from ocp.motion.builders.joint_motion import VelocitySetup, minimum_velocity_problem
@@ -75,7 +75,7 @@ __all__ = [
     "DeadEnd", "DynamicsSetup", "Finding", "FreeTime", "Goal", "Grasp", "IkConfigurations", "IkOptions",
     "IkSolver", "InFoot", "Incompleteness", "IndexAtLeast", "Indirect", "JointFriction", "Layer", "Limits",
     "MultipleShooting", "Phases", "Pinned", "Plan", "Problem", "ProblemError", "RateOptions", "Reconfiguration",
-    "RefinementSettings", "RefinementWarning", "RollObstacles", "RollSettings", "Scene", "Sensitivity", "Solution",
+    "RefinementSettings", "RefinementWarning", "RollSettings", "Scene", "Sensitivity", "Solution",
     "SolveError", "SolverStatus", "Stabiliser", "StancePhase", "StandingSetup", "Start", "StepWeights", "Steps",
     "StepsMotion", "StorageWarning", "Table", "TipTask", "Unreachable", "VelocitySetup", "Waypoints",
     "Weights", "capture_problem", "certificate", "chained_capture", "dynamics_phases", "dynamics_problem",

@@ -80,7 +80,7 @@ CREATED_BY_THE_PACKAGE = {
 WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
 CHECKED_BY_PROBLEMS = {
-    "AccelerationOptions", "DynamicsSetup", "IkOptions", "Pinned", "RateOptions", "RollObstacles",
+    "AccelerationOptions", "DynamicsSetup", "IkOptions", "Pinned", "RateOptions",
     "RollSettings", "StandingSetup", "VelocitySetup",
 }  # fmt: skip
 """Options whose fields are in the panels of the functions that take them, such as `dynamics_problem` and `resolve`."""

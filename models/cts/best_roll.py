@@ -27,6 +27,7 @@ import numpy as np
 from models.checks import require
 from models.cts.rig import HOME, Branch, Rig, RigConfiguration, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import (
+    ArcEndLevel,
     Candidate,
     chart_residual,
     check_constraints,
@@ -95,19 +96,6 @@ class Evaluation(NamedTuple):
     cos2: Expression
 
 
-class LevelBound(NamedTuple):
-    """A value of cos q2 (q2: joint angle 2) at which a constraint is active, and a lower bound of the cost near it.
-
-    `side` is as in RoughRoll.
-    """
-
-    bound: Expression
-    cosine: Expression
-    code: Expression
-    relevant: Expression
-    side: Expression
-
-
 INCUMBENT_SIZE, SOLUTION_SIZE = len(Incumbent._fields), 9
 NO_INCUMBENT = Incumbent(ca.inf, 1, 0, 0, ca.inf, ca.inf)
 NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
@@ -129,10 +117,11 @@ def stack(kind: Any, records: Sequence[Any]) -> Expression:
 
 def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
     """Return the columns of a matrix as named tuples of one class; this is the inverse of `stack`."""
-    return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
+    return [_record(kind, column) for column in ca.horzsplit(matrix)]
 
 
 def _record(kind: Callable[..., _Record], column: Expression) -> _Record:
+    """Return one column of a result of `stack` as a named tuple."""
     return kind(*ca.vertsplit(column))
 
 
@@ -309,33 +298,32 @@ class Search:
         for level in yaw_levels(self.rig, target, self.branch):
             bound = ca.SX(ca.inf)
             for roll in unstack(Evaluation, rolls):
-                over = roll.cos2 - level.cosine if level.above else level.cosine - roll.cos2
+                over = level.side * (roll.cos2 - level.cosine)
                 bound = ca.fmin(bound, ca.if_else(over < slack, roll.cost, ca.inf))
-            bound = ca.if_else(level.relevant, bound, ca.inf)
-            levels.append(LevelBound(bound, level.cosine, level.code, level.relevant, 1 if level.above else -1))
-        needed = ca.Function("levels", [target, rolls], ca.cse([stack(LevelBound, levels)]))
+            levels.append(level._replace(bound=ca.if_else(level.relevant, bound, ca.inf)))
+        needed = ca.Function("levels", [target, rolls], ca.cse([stack(ArcEndLevel, levels)]))
 
-        suspect, rough = ca.SX.sym("suspect", len(LevelBound._fields)), self._rough_roll_function(target)
-        _, cosine, code, _, side = _record(LevelBound, suspect)
-        ends = level_points(self.rig, target, cosine)
-        points = [rough(c, s, cosine, code, side, about=(cosine, slack)) for c, s in ends]
+        suspect, rough = ca.SX.sym("suspect", len(ArcEndLevel._fields)), self._rough_roll_function(target)
+        level = _record(ArcEndLevel, suspect)
+        ends = level_points(self.rig, target, level.cosine)
+        points = [rough(c, s, level.cosine, level.code, level.side, about=(level.cosine, slack)) for c, s in ends]
         near_level = ca.Function("rough", [target, suspect], ca.cse([stack(RoughRoll, points)]))
 
         def polished(at: Expression, end: RoughRoll) -> Point:
             return polish_to_level(self.rig, chart, at, value=end.value, above=end.side, point=(end.c, end.s))
 
         x, before = _inputs(ca.MX)
-        first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(LevelBound._fields))
+        first, column = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("suspect", len(ArcEndLevel._fields))
         answer = self._improve(polished, len(points))(x, before, near_level(x, column), first)
         search_level = evaluate_unless(ca.Function("level", [x, before, column, first], [answer]))
         evaluations = ca.MX.sym("seen", *rolls.shape)
         best = first
         for level in ca.horzsplit(needed(x, evaluations)):
-            settled = _record(LevelBound, level).bound >= _record(Incumbent, best).cost
+            settled = _record(ArcEndLevel, level).bound >= _record(Incumbent, best).cost
             best = search_level(settled, best, x, before, level, best)
         if np.isfinite([self.rig.limit(1, False), self.rig.limit(1, True)]).any():
             for level in ca.horzsplit(needed(x, evaluations)):
-                incumbent, relevant = _record(Incumbent, best), _record(LevelBound, level).relevant
+                incumbent, relevant = _record(Incumbent, best), _record(ArcEndLevel, level).relevant
                 cannot_improve = ca.fmin(incumbent.below, incumbent.above) >= incumbent.cost
                 settled = ca.logic_or(cannot_improve, ca.logic_not(relevant))
                 best = search_level(settled, best, x, before, level, best)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.checks import require
+from models.checks import require, set_fields
 from models.cts.best_roll import optimal_inverse
 from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, configuration_at, dh_frames, joints_of
 from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
@@ -49,7 +49,6 @@ class ClearanceSearch:
 
     Attributes:
         samples: Number of rolls in the grid.
-        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
         minima: Number of local minima on the grid that are refined.
         steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes; the last step is
             0.62^44 = 7e-10 of the grid's step.
@@ -59,7 +58,6 @@ class ClearanceSearch:
     """
 
     samples: int = 72
-    softness: float = 2e-3
     minima: int = 4
     steps: int = 44
     shrink: float = 0.62
@@ -102,7 +100,7 @@ class CollisionScene:
         if self.walls is not None:
             require.instance("scene: walls", self.walls, Box)
         for name, kind in (("solids", Box), ("capsules", Capsule)):
-            object.__setattr__(self, name, require.each(f"scene: {name}", getattr(self, name), kind))
+            set_fields(self, **{name: require.each(f"scene: {name}", getattr(self, name), kind)})
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
@@ -147,25 +145,6 @@ def clearances(
     return distances
 
 
-def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return the cost `weight` * exp(-`gap` / `width`), which grows as the gap (m) between rig and obstacles closes.
-
-    Raises:
-        ModelError: The weight is negative or not finite, or the width is not positive.
-    """
-    require.nonnegative("clearance: weight", weight)
-    require.positive("clearance: width", width, unit="m")
-    return weight * ca.exp(-gap / width)
-
-
-def checked_clearance(clearance: float) -> float:
-    """Return a required clearance (m); raise a ModelError unless it is finite, or -inf, which means no constraint."""
-    if require.number("rig: clearance", clearance, finite=False) == np.inf:
-        message = f"clearance {clearance} m must be a finite distance or -inf for none"
-        raise ModelError(message, name="clearance", value=clearance)
-    return clearance
-
-
 @dataclass(frozen=True)
 class Avoidance:
     """Settings of obstacle avoidance for the rig: clearance as a constraint, as a term of the cost index, or both.
@@ -174,25 +153,38 @@ class Avoidance:
         scene: Obstacles.
         clearance: Least distance of the rig from the scene, m; -inf for no constraint.
         weight, width: Weight and width (m) of the term weight exp(-gap / width) of the index.
+        softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
         radii: Radii of the rig's capsules; the default ones if None.
 
     Raises:
-        ModelError: A clearance that is nan or inf, a negative weight, a width that is not positive.
+        ModelError: A clearance that is nan or inf, a negative weight, a width or softness that is not positive.
     """
 
     scene: CollisionScene
     clearance: float = -np.inf
     weight: float = 0.0
     width: float = 0.05
+    softness: float = 2e-3
     radii: Radii | None = None
 
     def __post_init__(self) -> None:
         require.instance("avoidance: scene", self.scene, CollisionScene)
-        checked_clearance(self.clearance)
+        if require.number("avoidance: clearance", self.clearance, finite=False) == np.inf:
+            message = f"avoidance: clearance {self.clearance} m must be a finite distance or -inf for none"
+            raise ModelError(message, name="clearance", value=self.clearance)
         require.nonnegative("avoidance: weight", self.weight)
         require.positive("avoidance: width", self.width, unit="m")
+        require.positive("avoidance: softness", self.softness, unit="m")
         if self.radii is not None:
             require.instance("avoidance: radii", self.radii, Radii)
+
+    def gap(self, rig: Rig, q: Expression) -> Expression:
+        """Return the smooth least distance of the rig from the scene at joint positions q. Shape (1, 1), m."""
+        return soft_minimum(list(clearances(rig, q, self.scene, self.radii).values()), self.softness)
+
+    def cost(self, gap: Expression) -> Expression:
+        """Return the term of the cost index that grows as the gap (m) between rig and obstacles closes."""
+        return self.weight * ca.exp(-gap / self.width)
 
 
 def collision_free_inverse(
@@ -225,9 +217,9 @@ def collision_free_inverse(
     configuration = configuration_at(rig, target, c, s, branch=branch)
     roll = unwrap_roll(rig, c, s, previous)
     joints = joints_of(rig, target, roll, configuration)
-    gap = soft_minimum(list(clearances(rig, joints, avoidance.scene, avoidance.radii).values()), SEARCH.softness)
+    gap = avoidance.gap(rig, joints)
     cost = index_harmonics(rig, tunnel, target).value(c, s) + gain * (roll - previous) ** 2
-    cost += proximity_cost(gap, avoidance.weight, avoidance.width)
+    cost += avoidance.cost(gap)
     check = check_constraints(rig, target, configuration, c=c, s=s)
     within_limits = ca.logic_and(check.all_but_slide(), check.slide())
     feasible = ca.logic_and(within_limits, gap >= clearance)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, Sign, require, warn_of_degrees, warn_of_millimetres
+from models.checks import Array, ArrayInput, Sign, require, set_fields, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import FULL_TURN, Expression, Frame, expression, rotation
 
@@ -54,10 +54,10 @@ class Rig:
     def __post_init__(self) -> None:
         for name in LENGTHS:
             length = require.positive(f"rig: {name}", getattr(self, name), unit="m")
-            object.__setattr__(self, name, length)
+            set_fields(self, **{name: length})
             warn_of_millimetres(f"rig: {name}", length)
         for name in ("lower", "upper"):
-            object.__setattr__(self, name, require.array(f"rig: {name}", getattr(self, name), (6,), entries="numbers"))
+            set_fields(self, **{name: require.array(f"rig: {name}", getattr(self, name), (6,), entries="numbers")})
         for joint, (low, high) in enumerate(zip(self.lower, self.upper, strict=True), 1):
             if not low < high:
                 message = f"rig: joint {joint} has lower limit {low} not below its upper limit {high}"
@@ -106,7 +106,7 @@ class Tunnel:
     def __post_init__(self) -> None:
         signs: dict[str, Sign] = {"center": "any", "ranges": "positive", "weights": "nonnegative"}
         for name, sign in signs.items():
-            object.__setattr__(self, name, require.array(f"tunnel: {name}", getattr(self, name), (3,), sign=sign))
+            set_fields(self, **{name: require.array(f"tunnel: {name}", getattr(self, name), (3,), sign=sign)})
 
     @property
     def scale(self) -> Array:

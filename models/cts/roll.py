@@ -100,14 +100,16 @@ class ArcEndLevel(NamedTuple):
     Attributes:
         cosine: The value.
         code: Code of the constraint, in ACTIVE.
-        above: Whether the constraint is satisfied above the value, not below.
+        side: 1 if the constraint is satisfied above the value, -1 if below.
         relevant: Whether joints 2 and 3 are within their limits at the value, in the given branch.
+        bound: Lower bound of the cost near the value; -inf if unknown.
     """
 
     cosine: Expression
-    code: int
-    above: bool
+    code: Expression
+    side: Expression
     relevant: Expression
+    bound: Expression = -ca.inf
 
 
 def limit_code(joint: int, upper: bool) -> int:
@@ -172,8 +174,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
         for point in level_points(rig, target, level.cosine):
-            above = 1 if level.above else -1
-            end = polish_to_level(rig, chart, target, value=level.cosine, above=above, point=point)
+            end = polish_to_level(rig, chart, target, value=level.cosine, above=level.side, point=point)
             ends.append(Candidate(*end, level.code))
     return ends
 
@@ -211,7 +212,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
-        levels.append(ArcEndLevel(cosine, code, above, within))
+        levels.append(ArcEndLevel(cosine, code, 1 if above else -1, within))
 
     for sign, angle in ((1, 0.0), (-1, np.pi)):
         if _allows(rig, 2, angle):

@@ -90,11 +90,9 @@ def solve_table(
         ModelError: The table is empty or has a wrong shape, there is no branch or an unknown one, or a previous roll is
             not finite.
     """
-    require.instance("rig: rig", rig, Rig)
-    require.instance("rig: tunnel", tunnel, Tunnel)
     require.flag("table: in_sequence", in_sequence)
     rows = checked_targets(targets, finite=False)
-    branches = tuple(checked_branch(branch) for branch in require.each("table: branches", branches, Branch))
+    branches = require.each("table: branches", branches, Branch)
     if not branches:
         message = "table: branches is empty; give at least one, for example (HOME,)"
         raise ModelError(message, name="branches", value=branches)

@@ -152,15 +152,11 @@ class FreeFloating:
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Return the time derivative of the base configuration under the conserved momentum. Shape (base_size, 1)."""
+        twist = self.base_twist(base, q, joint_rates)
         if self.base == "planar":
-            twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
-        pose = self._checked_base(base)
-        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), self._momentum_in_base(base))
-        turn = self.world_from_base(base).rotation
-        quaternion, spin = pose[3:7], reaction.base_angular
-        turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # spin is in base axes
-        return ca.densify(ca.vertcat(ca.mtimes(turn, reaction.base_linear), turning))
+        spin = ca.vertcat(type(twist)(1, 1), twist[0:3])
+        return ca.densify(ca.vertcat(twist[3:6], quaternion_product(spin, self._checked_base(base)[3:7]) / 2))
 
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:

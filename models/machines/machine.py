@@ -161,21 +161,18 @@ class FixedBase:
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
 
-def with_tip(
-    machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
-) -> Machine:
-    """Return the machine with its tip at another frame, which is fixed in one of its links.
+def with_tip(machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0)) -> Machine:
+    """Return the machine with its tip at a frame in the axes of one of its links.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.
         link: Name of the link that carries the frame.
         translation: The frame's origin in the link's frame. Shape (3,), m.
-        rotation: The frame's axes, as columns, in the link's frame. Shape (3, 3); the identity if None.
 
     Raises:
         ModelError: Unknown link, wrong sizes, a machine that is not such a dataclass.
     """
-    return cast(Machine, replace(_with_robot(machine), robot=move_tip(machine.robot, link, translation, rotation)))
+    return cast(Machine, replace(_with_robot(machine), robot=move_tip(machine.robot, link, translation)))
 
 
 def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:

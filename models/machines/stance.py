@@ -281,16 +281,15 @@ class Stance(FixedBase):
         if sole is None:
             return ca.DM(0, 1)
         moment, force = self.load_in_sole(name, load)
-        offsets = (sole.normals * sole.vertices).sum(axis=1) + margin
         arm = ca.vertcat(-moment[1], moment[0])  # center of pressure times pressure
-        rows = ca.mtimes(ca.sparsify(ca.DM(sole.normals)), arm) - ca.DM(offsets) * force[2]
+        rows = ca.mtimes(ca.sparsify(ca.DM(sole.normals)), arm) - ca.DM(sole.offsets + margin) * force[2]
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
         """Return the indices of the sole's edges whose distance from the center of pressure depends on the motion."""
         sole = self.feet[name].sole
         assert sole is not None
-        distances = self._sampled_pressures[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)
+        distances = self._sampled_pressures[name] @ sole.normals.T - sole.offsets
         movable = np.ptp(distances, axis=0) > ROUNDING
         for i in np.flatnonzero(~movable):
             if distances[0, i] < margin - ROUNDING:

@@ -18,7 +18,7 @@ from models.checks import ROUNDING, Array, ArrayInput, require, set_fields
 from models.errors import ModelError
 from models.machines.machine import FixedBase, Wrenches, WrenchFunction, wrenches_at
 from models.machines.support import Support
-from models.robot.dynamics import Wrench, base_reaction, checked_wrenches, external_wrench, inverse_dynamics
+from models.robot.dynamics import Wrench, base_reaction, external_wrench, inverse_dynamics
 from models.robot.kinematics import (
     center_of_mass,
     checked_vector,
@@ -29,7 +29,6 @@ from models.robot.kinematics import (
 )
 from models.robot.parts import massless_error
 from models.robot.rebuild import simplify
-from models.robot.robot import Robot
 from models.spatial import Expression, expression
 
 
@@ -96,22 +95,11 @@ class Standing(FixedBase):
         """Gravitational acceleration in world axes. Shape (3,), m/s^2."""
         return np.array([0.0, 0.0, -self.gravity])
 
-    def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot after merging links that fixed joints connect, except links on which given wrenches act."""
-        keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
-        if keep not in self._bodies:
-            self._bodies[keep] = simplify(self.robot, keep)
-        return self._bodies[keep]
-
-    @cached_property
-    def _bodies(self) -> dict[frozenset[str], Robot]:
-        return {}
-
     def ground_reaction(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the ground's wrench on the foot: (moment about the world's origin, force). Shape (6, 1), N m, N."""
-        return base_reaction(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
+        return base_reaction(self.robot, q, qd, qdd, **self._forces(wrenches))
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
@@ -127,7 +115,7 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the joint torques (or forces) that a motion requires, by inverse dynamics. Shape (n, 1), N m or N."""
-        return inverse_dynamics(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
+        return inverse_dynamics(self.robot, q, qd, qdd, **self._forces(wrenches))
 
     def _forces(self, wrenches: Sequence[Wrench]) -> dict[str, Any]:
         """Return keyword arguments of `base_reaction` and `inverse_dynamics`: external wrenches, gravity, foot pose."""
@@ -356,7 +344,7 @@ def _motion_function(machine: Standing, wrenches: Wrenches, rows: Rows, symbols:
         "joint_torques": machine.joint_torques(q, qd, qdd, acting),
         "tip_in_world": machine.tip_pose((), q).position,
         "external_force": external_force,
-        "center_of_mass": center_of_mass(machine.bodies(), q, placement),
+        "center_of_mass": center_of_mass(simplify(robot), q, placement),
         "ground_force": reaction[3:6],
         "zero_moment_point": point,
         "index": machine.stability_index(point),

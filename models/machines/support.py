@@ -82,14 +82,13 @@ class Support:
     @cached_property
     def inner_radius(self) -> float:
         """Radius of the largest circle inside the polygon, m, which is the largest `margin` of any point."""
-        offsets = (self.normals * self.vertices).sum(axis=1)
         best = 0.0
-        for indices in combinations(range(len(offsets)), 3):  # the circle touches three edges
+        for indices in combinations(range(len(self.offsets)), 3):  # the circle touches three edges
             edges = list(indices)
             system = np.column_stack([self.normals[edges], -np.ones(3)])
             if abs(np.linalg.det(system)) > ROUNDING:
-                *point, radius = np.linalg.solve(system, offsets[edges])
-                if (self.normals @ point - offsets >= radius - ROUNDING).all():
+                *point, radius = np.linalg.solve(system, self.offsets[edges])
+                if (self.normals @ point - self.offsets >= radius - ROUNDING).all():
                     best = max(best, float(radius))
         return best
 
@@ -99,10 +98,15 @@ class Support:
         edges = np.roll(self.vertices, -1, axis=0) - self.vertices
         return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
 
+    @cached_property
+    def offsets(self) -> Array:
+        """Signed distances of the polygon's edges from the origin, along their normals. Shape (k,), m."""
+        return np.asarray((self.normals * self.vertices).sum(axis=1))
+
     def distances(self, point: Expression) -> Expression:
         """Return the signed distance of a point from each polygon edge's line, positive inside. Shape (k, 1), m."""
         point = checked_vector("point", point, 2, "x and y on the ground")
-        return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM((self.normals * self.vertices).sum(axis=1))
+        return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(self.offsets)
 
     def margin(self, point: Expression) -> Expression:
         """Return the least signed distance of a point from the lines of the polygon's edges. Shape (1, 1), m.

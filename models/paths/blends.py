@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import perm
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import casadi as ca
@@ -103,18 +104,11 @@ def quintic(start: End, end: End) -> Array:
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
     """Return points, or derivatives, of polynomial curves at parameters u. Shapes (..., 6, 3), (...) -> (..., 3)."""
-    factors = _falling_factorials(order)
-    value = coefficients[..., 5, :] * factors[5]
+    value = coefficients[..., 5, :] * perm(5, order)
     u = np.asarray(u, dtype=float)[..., None]
     for k in range(4, order - 1, -1):
-        value = value * u + coefficients[..., k, :] * factors[k]
+        value = value * u + coefficients[..., k, :] * perm(k, order)
     return np.asarray(value)
-
-
-@lru_cache(maxsize=6)
-def _falling_factorials(order: int) -> list[float]:
-    # k (k - 1) ... (k - order + 1)
-    return [float(np.prod(np.arange(k - order + 1, k + 1))) if k >= order else 0.0 for k in range(6)]
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:

@@ -20,6 +20,7 @@ import numpy as np
 from models.checks import require, set_fields
 from models.robot.kinematics import (
     Placement,
+    center_of_mass,
     checked_placement,
     checked_vector,
     constant,
@@ -143,9 +144,9 @@ def external_wrench(
     """Return the resultant of external wrenches: (moment about the world's origin, force). Shape (6, 1)."""
     frames = link_frames(robot, q, world_from_base)
     total: Expression = ca.DM(6, 1)
-    for column, wrench in enumerate(checked_wrenches(wrenches)):
-        moment, force, point = _parts(stacked_wrenches(robot, wrenches), column)
-        total = total + ca.vertcat(moment + cross(frames[wrench.link].point(point), force), force)
+    for wrench in checked_wrenches(wrenches):
+        arm = frames[robot.link(wrench.link).name].point(wrench.point)
+        total = total + ca.vertcat(wrench.moment + cross(arm, wrench.force), wrench.force)
     return ca.densify(total)
 
 
@@ -353,29 +354,25 @@ def momentum(
     world_from_base: Placement | None = None,
 ) -> Expression:
     """Return the robot's angular momentum about a fixed point, and its linear momentum. Shape (6, 1), N m s and N s."""
-    rates = joint_vector(robot, qd, "qd")
-    return _about_point(about, ca.mtimes(momentum_matrix(robot, q, world_from_base), rates))
+    total = ca.mtimes(momentum_matrix(robot, q, world_from_base), joint_vector(robot, qd, "qd"))
+    arm = checked_vector("about", about, 3, "a point of the world")
+    return ca.densify(ca.vertcat(total[0:3] - cross(arm, total[3:6]), total[3:6]))
+
+
+class CenterOfMassMotion(NamedTuple):
+    """Position (m), velocity and acceleration of the centre of mass of the whole robot. Shape (3, 1) each."""
+
+    position: Expression
+    velocity: Expression
+    acceleration: Expression
 
 
 @on_scalars
-def momentum_rate(
-    robot: Robot,
-    q: Expression,
-    qd: Expression,
-    qdd: Expression,
-    *,
-    about: Expression = (0.0, 0.0, 0.0),
-    world_from_base: Placement | None = None,
-) -> Expression:
-    """Return the rate of change of the robot's angular momentum about a fixed point and of its linear momentum, (6, 1).
-
-    It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
-    """
-    rate = base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base)
-    return _about_point(about, rate)
-
-
-def _about_point(point: Expression, wrench: Expression) -> Expression:
-    """Convert a wrench or momentum about the world's origin to one about another point. Shape (6, 1)."""
-    arm = checked_vector("about", point, 3, "a point of the world")
-    return ca.densify(ca.vertcat(wrench[0:3] - cross(arm, wrench[3:6]), wrench[3:6]))
+def center_of_mass_motion(
+    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
+) -> CenterOfMassMotion:
+    """Return position, velocity and acceleration of the robot's centre of mass; raise ModelError if it has no mass."""
+    position = center_of_mass(robot, q, world_from_base)
+    velocity = ca.mtimes(center_of_mass_jacobian(robot, q, world_from_base), joint_vector(robot, qd, "qd"))
+    force = base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base)[3:6]
+    return CenterOfMassMotion(position, ca.densify(velocity), ca.densify(force / robot.total_mass))

@@ -328,7 +328,7 @@ class Robot:
             joint, indent = waiting.pop()
             last = joint is children[joint.parent][-1]
             lines.append(
-                f"{indent}{'└─' if last else '├─'} {joint.name} ({_limits(joint)}) -> {joint.child}  "
+                f"{indent}{'└─' if last else '├─'} {joint.name} ({_joint_text(joint)}) -> {joint.child}  "
                 f"{self.link(joint.child).mass:g} kg"
             )
             indent += "   " if last else "│  "
@@ -336,7 +336,7 @@ class Robot:
         return "\n".join(lines)
 
 
-def _limits(joint: Joint) -> str:
+def _joint_text(joint: Joint) -> str:
     unit, parts = joint.unit, [str(joint.kind)]
     if (tie := joint.mimic) is not None:
         parts.append(f"{tie.multiplier:g} x {tie.joint}" + (f" {tie.offset:+g} {unit}" if tie.offset else ""))

@@ -275,34 +275,31 @@ def _distance_of_columns(
     kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
 ) -> Any:
     """Return the signed distance of two shapes of the given kinds, each described by its column (see `column`)."""
-    first, second = map(_core_of_column, kinds, entries)
     swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
-    if isinstance(first, PlaneCore):
-        gap = _least_height(second, first.normal, first.point, rounding)
-    elif isinstance(second, PlaneCore):
-        gap = _least_height(first, second.normal, second.point, rounding)
-    elif isinstance(first, SegmentCore) and isinstance(second, SegmentCore):
-        gap = distance_of_segments(first, second, rounding, stop_gradient)
-    else:
-        core, box = (first, second) if isinstance(second, BoxCore) else (second, first)
-        assert isinstance(core, SegmentCore | BoxCore)
-        assert isinstance(box, BoxCore)
-        gap = distance_to_box(core, box, rounding, stop_gradient)
-    return gap - swept_radius
+    first, second = map(_core_of_column, kinds, entries)
+    return _distance_of_cores(first, second, rounding, stop_gradient) - swept_radius
 
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
     """Return the signed distance of two shapes, one of them a `Polytope`, at `poses` (each a rotation and position)."""
-    first_core, second_core = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
-    if isinstance(first_core, PlaneCore):
-        gap = _least_height(second_core, first_core.normal, first_core.point, rounding)
-    elif isinstance(second_core, PlaneCore):
-        gap = _least_height(first_core, second_core.normal, second_core.point, rounding)
-    else:
-        gaps = [*_face_gaps(first_core, second_core, rounding), *_face_gaps(second_core, first_core, rounding)]
-        gap = largest_of(gaps, rounding, keep_gradient)
-    return gap - (first.swept_radius + second.swept_radius)
+    cores = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
+    return _distance_of_cores(*cores, rounding, keep_gradient) - (first.swept_radius + second.swept_radius)
+
+
+def _distance_of_cores(first: Core, second: Core, rounding: float, stop_gradient: StopGradient) -> Any:
+    if isinstance(first, PlaneCore):
+        return _least_height(second, first.normal, first.point, rounding)
+    if isinstance(second, PlaneCore):
+        return _least_height(first, second.normal, second.point, rounding)
+    if isinstance(first, HullCore) or isinstance(second, HullCore):
+        gaps = [*_face_gaps(first, second, rounding), *_face_gaps(second, first, rounding)]
+        return largest_of(gaps, rounding, stop_gradient)
+    if isinstance(second, BoxCore):
+        return distance_to_box(first, second, rounding, stop_gradient)
+    if isinstance(first, BoxCore):
+        return distance_to_box(second, first, rounding, stop_gradient)
+    return distance_of_segments(first, second, rounding, stop_gradient)
 
 
 def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:

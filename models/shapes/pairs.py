@@ -49,6 +49,9 @@ MARGIN_M = 1e-6
 class ProofSettings:
     """Limits of the computing effort to prove that a pair of bodies need not be checked for collision."""
 
+    configurations: int = (
+        1000  # random configurations; bodies that collide in all of them are assumed to collide always
+    )
     first_configurations: int = 24  # random configurations that are tried before a proof
     boxes: int = 2000  # boxes of joint positions that a proof may use with up to three joints between the bodies
     rounds: int = 40  # bisections of the boxes
@@ -83,8 +86,6 @@ def checked_pairs(
     srdf: str | os.PathLike[str] | None = None,
     limits: tuple[ArrayInput, ArrayInput] | None = None,
     clearance: float = 0.0,
-    seed: int = 0,
-    samples: int = 1000,
 ) -> Pairs:
     """Return the pairs of a robot's bodies to check for collision: those that can collide but do not always collide.
 
@@ -106,8 +107,6 @@ def checked_pairs(
         limits: Lower and upper limits of the joint vector, rad or m, each a number or of shape (dof,); the robot's own
             if None.
         clearance: Pairs that may come this close are checked, m.
-        seed: Seed of the random configurations.
-        samples: Number of random configurations.
 
     Raises:
         ModelError: A link is unknown (names similar ones), a body, limit or number is invalid, or the SRDF file cannot
@@ -132,18 +131,17 @@ def checked_pairs(
         k = int(np.flatnonzero(low > high)[0])
         message = f"{owner}: lower {low[k]} of joint {robot.joint_names[k]!r} is above upper {high[k]}"
         raise ModelError(message, name="lower", value=float(low[k]), limit=float(high[k]))
-    count = require.count(f"{owner}: samples", samples)
     margin = require.nonnegative(f"{owner}: clearance", clearance, unit="m") + MARGIN_M
-    rng = np.random.default_rng(require.count(f"{owner}: seed", seed, least=0, most=2**63))
     named = dict.fromkeys([] if srdf is None else _disabled_pairs(robot, srdf), SRDF)
     named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
-    key = _key(robot, bodies, named, low, high, margin, count, seed)
+    key = _key(robot, bodies, named, low, high, margin)
     if (known := _read(load_value(key), bodies)) is not None:
         return known
     parts = RigidParts.of(robot)
     adjacent = parts.adjacent({parts.of_link[body.link] for body in bodies})
-    classifier = _PairClassifier(robot, parts, low, high, _random_configurations(robot, low, high, count, rng), margin)
+    configurations = _random_configurations(robot, low, high, SETTINGS.configurations, np.random.default_rng(0))
+    classifier = _PairClassifier(robot, parts, low, high, configurations, margin)
     checked: list[tuple[int, int]] = []
     excluded: dict[tuple[str, str], Reason] = {}
     for i, j in combinations(range(len(bodies)), 2):
@@ -250,7 +248,6 @@ class _PairClassifier:
     configurations: Array
     margin: float
     _by_hulls: dict[tuple[int, int], Reason | None] = field(default_factory=dict)
-    _placed: dict[tuple[str, int], _PlacedBody] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
         """Return why two bodies need no check (None if they need one), and whether hulls replace covers in the check.
@@ -258,7 +255,8 @@ class _PairClassifier:
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
         """
-        pair = self._pair(first.link, first.shape, second.link, second.shape)
+        links = first.link, second.link
+        pair = self._pair(links, (first.shape, second.shape))
         reason = pair.classify(self.low, self.high, self.configurations, self.margin, first.overhang + second.overhang)
         two_joints = len(pair.up) + len(pair.down) == 2
         if not (first.mesh or second.mesh) or not (reason != NEVER if two_joints else reason == COVERED):
@@ -266,7 +264,7 @@ class _PairClassifier:
         key = id(first.mesh or first), id(second.mesh or second)
         if key not in self._by_hulls:
             shapes = [each.mesh.hull if each.mesh else each.shape for each in (first, second)]
-            hulls = self._pair(first.link, shapes[0], second.link, shapes[1])
+            hulls = self._pair(links, shapes)
             if two_joints:
                 self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
             else:
@@ -275,17 +273,11 @@ class _PairClassifier:
             return hull_reason, False
         return (None, not two_joints) if reason == COVERED else (reason, False)
 
-    def _pair(self, first_link: str, first: Shape, second_link: str, second: Shape) -> _BodyPair:
+    def _pair(self, links: tuple[str, str], shapes: Sequence[Shape]) -> _BodyPair:
         parts = self.parts
-        up, down = parts.path(parts.of_link[first_link], parts.of_link[second_link])
-        return _BodyPair(self.robot, self._place(first_link, first), self._place(second_link, second), up, down)
-
-    def _place(self, link: str, shape: Shape) -> _PlacedBody:
-        """Return a shape of a link in the frame of the rigid part that contains the link."""
-        key = link, id(shape)
-        if key not in self._placed:
-            self._placed[key] = _PlacedBody(shape.placed(*self.parts.pose[link]))
-        return self._placed[key]
+        bodies = [_PlacedBody(body.placed(*parts.pose[link])) for link, body in zip(links, shapes, strict=True)]
+        up, down = parts.path(*(parts.of_link[link] for link in links))
+        return _BodyPair(self.robot, bodies[0], bodies[1], up, down)
 
 
 class _PlacedBody:
@@ -350,9 +342,8 @@ class _BodyPair:
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
         """Return lower bounds, m, of the distance at given poses of the second body, exact if the search converges."""
         shapes = self.first.shape, self.second.shape
-        first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
-        first = np.broadcast_to(first, (len(turn), *first.shape))
-        second = second @ turn.transpose(0, 2, 1) + shift[:, None]
+        first = np.broadcast_to(shapes[0].core, (len(turn), *shapes[0].core.shape))
+        second = shapes[1].core @ turn.transpose(0, 2, 1) + shift[:, None]
         direction = nearest_directions(first, second, (isinstance(shapes[0], Box), isinstance(shapes[1], Box)))[0]
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 

@@ -276,8 +276,8 @@ class Mesh(Polytope):
                 raise ModelError(f"mesh: file {self.file!r} is not a path", name="file", value=self.file)
             from models.shapes.mesh_files import read_mesh
 
-            for name, value in zip(("vertices", "faces"), read_mesh(self.file), strict=True):
-                set_fields(self, **{name: value})
+            vertices, faces = read_mesh(self.file)
+            set_fields(self, vertices=vertices, faces=faces)
         elif self.vertices is None:
             raise ModelError("mesh: vertices are missing; give vertices or a file", name="vertices", value=None)
         vertices = require.array("mesh: vertices", self.vertices, ("vertices", 3), least=4)
@@ -302,9 +302,8 @@ class Mesh(Polytope):
     def around(cls, hull: Hull) -> Mesh:
         """Return the mesh shape of a known convex hull, without computing the hull again."""
         mesh = object.__new__(cls)
-        fields = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
-        for name, value in {**fields, "file": None, "scale": np.ones(3), "hull": hull}.items():
-            set_fields(mesh, **{name: value})
+        set_fields(mesh, vertices=hull.vertices, faces=hull.faces, file=None, scale=np.ones(3), hull=hull)
+        set_fields(mesh, position=np.zeros(3), rotation=np.eye(3))
         return mesh
 
 

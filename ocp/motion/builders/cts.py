@@ -18,11 +18,10 @@ import numpy as np
 
 from models.checks import Array, real
 from models.cts.best_roll import optimal_inverse
-from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
+from models.cts.clearance import Avoidance
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
 from models.cts.roll import index_harmonics
 from models.cts.table import checked_targets
-from models.shapes.distance import soft_minimum
 from models.spatial import FULL_TURN
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
@@ -106,39 +105,6 @@ class RollSettings:
             raise ProblemError(words, name="symbols", value=self.symbols)
 
 
-@dataclass(frozen=True, eq=False)
-class RollObstacles:
-    """Obstacles that the rig must avoid in `roll_problem`, and the settings of this avoidance.
-
-    Attributes:
-        scene: Obstacles.
-        clearance: Least distance from the obstacles, m; -inf for no constraint.
-        clearance_weight, clearance_width: Weight and width (m) of the term weight exp(-distance / width) of the index.
-        softness: Width of the smooth minimum of all distances, m, see soft_minimum.
-        radii: Radii of the rig's capsules; None for their defaults.
-
-    Raises:
-        ProblemError: A value is invalid.
-    """
-
-    scene: CollisionScene
-    clearance: float = 0.0
-    clearance_weight: float = 0.0
-    clearance_width: float = 0.05
-    softness: float = 2e-3
-    radii: Radii | None = None
-
-    def __post_init__(self) -> None:
-        require.instance("roll_problem: scene", self.scene, CollisionScene)
-        require.nonnegative("roll_problem: clearance_weight", self.clearance_weight)
-        require.positive("roll_problem: clearance_width", self.clearance_width)
-        require.positive("roll_problem: softness", self.softness)
-        if self.radii is not None:
-            require.instance("roll_problem: radii", self.radii, Radii)
-        with problem_errors("roll_problem: "):
-            checked_clearance(self.clearance)
-
-
 @interruptible
 def roll_problem(
     rig: Rig,
@@ -149,7 +115,7 @@ def roll_problem(
     start_roll: float | None = None,
     start_rate: float | None = None,
     settings: RollSettings | None = None,
-    obstacles: RollObstacles | None = None,
+    avoidance: Avoidance | None = None,
 ) -> Problem:
     """Declare the optimal control problem of the rig's redundant angle (roll) along a trajectory of tool targets.
 
@@ -163,7 +129,7 @@ def roll_problem(
         horizon: Final time, s.
         start_roll, start_rate: Roll (rad) and rate (rad/s) at time 0; free if None.
         settings: Weights and limits.
-        obstacles: Obstacles; None for none.
+        avoidance: Obstacles to avoid; None for none.
 
     Raises:
         ProblemError: The horizon is not positive; no roll reaches one of the targets; the start is outside the limits.
@@ -175,8 +141,8 @@ def roll_problem(
     require.instance("roll_problem: rig", rig, Rig)
     require.instance("roll_problem: tunnel", tunnel, Tunnel)
     settings = RollSettings() if settings is None else require.instance("settings", settings, RollSettings)
-    if obstacles is not None:
-        require.instance("obstacles", obstacles, RollObstacles)
+    if avoidance is not None:
+        require.instance("avoidance", avoidance, Avoidance)
     symbols, largest, fastest = settings.symbols, settings.acceleration_limit, settings.rate_limit
     x, phi = ca.SX.sym("target", 5), ca.SX.sym("roll")
     c, s = ca.cos(phi), ca.sin(phi)
@@ -189,12 +155,11 @@ def roll_problem(
     proximity: Any = 0.0
     violation = _violation(reach, -LARGEST_SINE, LARGEST_SINE)
     violation += _violation(limited, rig.lower[bounded], rig.upper[bounded])
-    if obstacles is not None:
-        distances = clearances(rig, joints, obstacles.scene, obstacles.radii)
-        gap = soft_minimum(list(distances.values()), obstacles.softness)
-        proximity = proximity_cost(gap, obstacles.clearance_weight, obstacles.clearance_width)
-        if np.isfinite(obstacles.clearance):
-            violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
+    if avoidance is not None:
+        gap = avoidance.gap(rig, joints)
+        proximity = avoidance.cost(gap)
+        if np.isfinite(avoidance.clearance):
+            violation += ca.fmax(avoidance.clearance + SEARCH.margin * avoidance.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)
     time = symbols.sym("time")
     target_at = track_expression(targets, time, (5, 1), label="targets")
@@ -232,8 +197,8 @@ def roll_problem(
     if bounded:
         unit = ", ".join(dict.fromkeys("rad" if k else "m" for k in bounded))  # the first joint slides
         problem.path("limits", along("joints", limited), rig.lower[bounded], rig.upper[bounded], unit=unit)
-    if obstacles is not None and np.isfinite(obstacles.clearance):
-        problem.path("clearance", along("gap", gap), obstacles.clearance, unit="m")
+    if avoidance is not None and np.isfinite(avoidance.clearance):
+        problem.path("clearance", along("gap", gap), avoidance.clearance, unit="m")
     running = along("index", index + proximity)
     running = running + settings.rate_weight * rate**2 + settings.acceleration_weight * acceleration**2
     problem.minimize(running=running)

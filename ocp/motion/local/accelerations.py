@@ -19,8 +19,8 @@ import numpy as np
 from models.checks import Array
 from models.machines.machine import Wrenches, wrenches_at
 from models.machines.standing import Standing, StandingMotion, evaluate_motion, motion_function
-from models.robot.dynamics import momentum
-from models.robot.kinematics import center_of_mass_motion, joint_limit_index, manipulability_of
+from models.robot.dynamics import center_of_mass_motion, momentum
+from models.robot.kinematics import joint_limit_index, manipulability_of
 from ocp.console import interruptible
 from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require

@@ -11,10 +11,10 @@ import numpy as np
 
 from models import Box, Rig, Tunnel, optimal_inverse
 from models.checks import Array
-from models.cts.clearance import CollisionScene, clearances
+from models.cts.clearance import Avoidance, CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
-from ocp import Collocation, Problem, RollObstacles, RollSettings, roll_problem, solve
+from ocp import Collocation, Problem, RollSettings, roll_problem, solve
 from scripts.drawing import COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep
@@ -76,7 +76,7 @@ def sweep_problem(rig: Rig, tunnel: Tunnel) -> Problem:
             acceleration_limit=ACCELERATION_LIMIT,
             symbols=ca.SX,
         ),
-        obstacles=RollObstacles(obstacle(), clearance=CLEARANCE),
+        avoidance=Avoidance(obstacle(), clearance=CLEARANCE),
     )
 
 

@@ -85,6 +85,7 @@ CASES = [
             "clearance": but(FINITE, "minus inf") | NOTHING,
             "weight": NONNEGATIVE | NOTHING,
             "width": POSITIVE | NOTHING,
+            "softness": POSITIVE | NOTHING,
             "radii": but(INSTANCE, "None"),
         },
     ),

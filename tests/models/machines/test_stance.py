@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from models import Foot, Foothold, ModelError, Stance, Standing, Support, Wrench, inverse_dynamics, rectangle, reroot
 from models.robot.dynamics import base_reaction
-from models.robot.kinematics import link_motions
 from scripts.robots.robots import TALOS
 from scripts.robots.steps import SIDES, planar_biped, planar_feet
 from scripts.robots.talos import HELD, talos_steps
-from tests.models.robot.trees import Array, numeric, numeric_poses, random_frame, random_robot
+from tests.models.robot.trees import Array, link_twist, numeric, numeric_poses, random_frame, random_robot
 
 few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -37,17 +36,10 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
     place = random_frame(rng)
     torques = numeric(inverse_dynamics(robot, q, qd, qdd, world_from_base=place)).ravel()
     held = numeric(base_reaction(robot, q, qd, qdd, world_from_base=place)).ravel()
-    motion = link_motions(robot, q, qd, qdd, world_from_base=place)[root]
+    base_motion = link_twist(robot, root, (q, qd, qdd), place, np.zeros(3))
     frame = numeric_poses(robot, q, place)[root]
-    spin, change = numeric(motion.angular_velocity).ravel(), numeric(motion.angular_acceleration).ravel()
-    arm = frame[1] - numeric(motion.center).ravel()
-    velocity = numeric(motion.velocity).ravel() + np.cross(spin, arm)
-    acceleration = numeric(motion.acceleration).ravel() + np.cross(change, arm) + np.cross(spin, np.cross(spin, arm))
     at_old = Wrench(robot.root, held[3:], held[:3] - np.cross(place[1], held[3:]))
-    moving: dict[str, Any] = {
-        "world_from_base": frame,
-        "base_motion": (np.concatenate([spin, velocity]), np.concatenate([change, acceleration])),
-    }
+    moving: dict[str, Any] = {"world_from_base": frame, "base_motion": base_motion}
     scale = max(1.0, np.abs(held).max(), np.abs(torques).max())
     again = numeric(inverse_dynamics(turned, q[order], qd[order], qdd[order], wrenches=[at_old], **moving)).ravel()
     np.testing.assert_allclose(again, torques[order], rtol=0, atol=1e-9 * scale)
@@ -75,11 +67,9 @@ def test_the_feet_bear_the_rate_of_momentum_that_pinocchio_finds(held: tuple[str
         q, qd, qdd = rng.normal(size=(3, stance.joint_size))
         loads = stance.loads(q, qd, qdd, random_loads(rng, stance))
         turn, position = numeric_poses(stance.robot, q, stance.world_from_base())[steps.robot.root]
-        motion = link_motions(stance.robot, q, qd, qdd, world_from_base=stance.world_from_base())[steps.robot.root]
-        spin, change = (numeric(part).ravel() for part in (motion.angular_velocity, motion.angular_acceleration))
-        arm = position - numeric(motion.center).ravel()
-        speed = turn.T @ (numeric(motion.velocity).ravel() + np.cross(spin, arm))
-        push = numeric(motion.acceleration).ravel() + np.cross(change, arm) + np.cross(spin, np.cross(spin, arm))
+        motion = (q, qd, qdd)
+        twist, rate = link_twist(stance.robot, steps.robot.root, motion, stance.world_from_base(), np.zeros(3))
+        spin, speed, change, push = twist[:3], turn.T @ twist[3:], rate[:3], rate[3:]
         configuration, v, a = pinocchio.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
         configuration[:3] = position
         configuration[3:7] = pinocchio.Quaternion(turn).coeffs()

@@ -20,7 +20,6 @@ from models import (
     center_of_mass,
     frame_jacobian,
     link_frames,
-    link_motions,
     planar_chain,
     rectangle,
     standing_example,
@@ -28,7 +27,7 @@ from models import (
 from models.machines.standing import center_of_pressure, standing_motion, tip_spring
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
 from tests.models.robot.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
-from tests.models.robot.trees import Array, few, numeric, random_robot, random_rotation, seeds
+from tests.models.robot.trees import Array, few, link_twist, numeric, random_robot, random_rotation, seeds
 
 FOOT = rectangle((-0.1, 0.1), (-0.1, 0.1))
 EXAMPLE = standing_example()
@@ -101,11 +100,13 @@ def test_a_machine_at_rest_presses_below_its_centre_of_mass(case: Case) -> None:
 def test_the_zero_moment_point_is_that_of_the_sums_over_links(case: Case) -> None:
     """(2)-(3), with the force of (35)-(36) corrected: it enters as a moment, and the vertical one below the line."""
     _, machine, motion, wrench = case
-    motions = link_motions(machine.robot, *motion, world_from_base=machine.world_from_base())
-    frames = link_frames(machine.robot, motion[0], machine.world_from_base())
+    place = machine.world_from_base()
+    frames = link_frames(machine.robot, motion[0], place)
     numerator, denominator = np.zeros(2), 0.0
     for link in machine.robot.links:
-        center, _, acceleration, spin, turning = map(flat, motions[link.name])
+        twist, rate = link_twist(machine.robot, link.name, motion, place, link.center_of_mass)
+        spin, turning, acceleration = twist[:3], rate[:3], rate[3:]
+        center = flat(frames[link.name].point(link.center_of_mass))
         turn = numeric(frames[link.name].rotation)
         inertia = turn @ link.inertia @ turn.T
         moment = inertia @ turning + np.cross(spin, inertia @ spin)

@@ -248,8 +248,7 @@ MOTIONS = [
     of("mass_matrix", AT, q=array(2)),
     of("frame_jacobian", {**AT, "link": "link1"}, **KINEMATICS, link=UNKNOWN, point=SPATIAL),
     of("momentum", MOVING, **KINEMATICS, qd=array(2), about=SPATIAL),
-    of("momentum_rate", DRIVEN, **{**KINEMATICS, **MOTION}, about=SPATIAL),
-    *[of(name, DRIVEN, **{**KINEMATICS, **MOTION}) for name in ("center_of_mass_motion", "link_motions")],
+    of("center_of_mass_motion", DRIVEN, **{**KINEMATICS, **MOTION}),
     *[of(name, DRIVEN, **{**KINEMATICS, **MOTION, **DYNAMICS}) for name in ("inverse_dynamics", "base_reaction")],
     Case(
         "Wrench",

@@ -28,7 +28,6 @@ from models import (
     mass_matrix,
     momentum,
     momentum_matrix,
-    momentum_rate,
     prune,
     robot_inertia,
     subtree,
@@ -82,7 +81,6 @@ def test_a_robot_with_followers_is_the_free_one_restricted_to_the_ties(seed: int
     agree(lambda r, q, *_: robot_inertia(r, q, place))
     agree(lambda r, q, *_: center_of_mass(r, q, place))
     agree(lambda r, q, qd, _: momentum(r, q, qd, about=about, world_from_base=place))
-    agree(lambda r, q, v, a: momentum_rate(r, q, v, a, about=about, **moved))
     agree(lambda r, *motion: np.hstack([numeric(part) for part in center_of_mass_motion(r, *motion, **moved)]))
     base = random_base(rng, "spatial")
     floating, loose = FreeFloating(robot), FreeFloating(free)

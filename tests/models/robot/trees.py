@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
@@ -199,6 +199,16 @@ def twist_by_differentiation(rotation: Any, position: Any, variables: Any, rates
     """(vee(R' R^T), p') of a frame."""
     turning = ca.mtimes(directional(rotation, variables, rates), rotation.T)
     return ca.vertcat(vee(turning), directional(position, variables, rates))
+
+
+def link_twist(robot: Robot, link: str, motion: Sequence[Array], placement: Any, point: Any) -> tuple[Array, Array]:
+    """Twist (angular, linear) of a point of a link in world axes, and its rate, from the link's frame alone."""
+    q, qd, qdd = (ca.SX.sym(name, robot.dof) for name in ("q", "qd", "qdd"))
+    frame = link_frames(robot, q, placement)[link]
+    twist = twist_by_differentiation(frame.rotation, frame.point(point), q, qd)
+    rate = directional(twist, ca.vertcat(q, qd), ca.vertcat(qd, qdd))
+    values = ca.Function("twist", [q, qd, qdd], [twist, rate])(*motion)
+    return numeric(values[0]).ravel(), numeric(values[1]).ravel()
 
 
 def momentum_by_differentiation(robot: Robot, frames: Any, variables: Any, rates: Any) -> Any:

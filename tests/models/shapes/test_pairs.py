@@ -484,8 +484,6 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"limits": 1.0}, "limits"),
     ({"limits": (2.0, 1.0)}, "lower"),
     ({"clearance": -0.1}, "clearance"),
-    ({"seed": -1}, "seed"),
-    ({"samples": 0}, "samples"),
 ]
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from models import Box, Rig, optimal_inverse, reference_rig, reference_tunnel
-from models.cts.clearance import CollisionScene, clearances
+from models.cts.clearance import Avoidance, CollisionScene, clearances
 from models.cts.rig import HOME, INCH, inverse
-from ocp import Collocation, ProblemError, RollObstacles, RollSettings, Solution, roll_problem, solve, spline_targets
+from ocp import Collocation, ProblemError, RollSettings, Solution, roll_problem, solve, spline_targets
 from ocp.motion.builders.cts import least_cost_roll
 from tests.models.cts.cts_oracle import index_by_geometry
 
@@ -49,11 +49,11 @@ def least_gaps(around: CollisionScene, joints: Any) -> Any:
 def roll_arguments(options: dict[str, Any]) -> dict[str, Any]:
     """Arguments of roll_problem, those of its settings and obstacles collected there."""
     options, arguments = dict(options), {}
-    for name, kind in (("settings", RollSettings), ("obstacles", RollObstacles)):
+    for name, kind in (("settings", RollSettings), ("avoidance", Avoidance)):
         names = {field.name for field in fields(kind)} & options.keys()
         values = {each: options.pop(each) for each in names}
         if values:
-            arguments[name] = kind(**({"scene": CollisionScene()} if name == "obstacles" else {}) | values)
+            arguments[name] = kind(**({"scene": CollisionScene()} if name == "avoidance" else {}) | values)
     return arguments | options
 
 
@@ -98,7 +98,7 @@ def test_the_plan_avoids_an_obstacle_by_its_free_roll() -> None:
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
     assert least_gaps(around, free).min() < -0.02  # in its midst
     problem = roll_problem(
-        RIG, TUNNEL, falling, HORIZON, settings=RollSettings(symbols=ca.SX), obstacles=RollObstacles(around, 0.01)
+        RIG, TUNNEL, falling, HORIZON, settings=RollSettings(symbols=ca.SX), avoidance=Avoidance(around, 0.01)
     )
     solution = solve(problem, SMOOTH)
     assert least_gaps(around, joints_along(RIG, solution, solution.t)).min() >= 0.01 - 1e-6
@@ -140,7 +140,7 @@ def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
     def mean(weight: float) -> float:
-        result = plan(scene=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
+        result = plan(scene=around, clearance=-np.inf, weight=weight, acceleration_weight=0.02)
         return float(least_gaps(around, joints_along(RIG, result, np.linspace(0, HORIZON, 101))).mean())
 
     assert mean(0.02) > mean(0.0) + 5e-3
@@ -173,9 +173,7 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
         ({"start_roll": np.nan}, "start_roll nan"),
         ({"horizon": 0.0}, "horizon"),
         ({"rate_limit": -1.0}, "rate_limit"),
-        ({"clearance_weight": -1.0}, "clearance_weight"),
-        ({"clearance_width": 0.0}, "clearance_width"),
-        ({"clearance": np.nan}, "clearance must be a number, not nan"),
+        ({"avoidance": 0.1}, "avoidance must be a Avoidance"),
     ],
 )
 def test_impossible_plans_are_refused_by_name(options: dict[str, Any], message: str) -> None:
