@@ -197,6 +197,18 @@ class Checks:
             raise self.invalid(label, f"a list of {kind.__name__}", values, kind.__name__) from error
         return tuple(self.instance(label, item, kind) for item in items)
 
+    def call(self, label: str, function: Any, *arguments: Any) -> Any:
+        """Return the value of a user's function; raise an error of the package that names the function if it fails.
+
+        Errors of a package, and those of CasADi that are due to SX symbols, are passed on.
+        """
+        try:
+            return function(*arguments)
+        except (RuntimeError, DetailedError):
+            raise
+        except Exception as error:  # raised by the function itself
+            raise self.error(f"{label}: the function fails: {error!r}", name=label, value=function) from error
+
     def mapping(self, label: str, values: Any, keys: type = str) -> dict[Any, Any]:
         """Return a copy of a dictionary after checking the class of its keys; return an empty dictionary for None."""
         if not isinstance(values, Mapping | None) or not all(isinstance(key, keys) for key in values or ()):

@@ -268,7 +268,9 @@ def wrenches_at(
     wrenches: Wrenches, machine: Machine, base: Expression, q: Expression, *, time: Expression
 ) -> tuple[Wrench, ...]:
     """Return the external wrenches on a machine at a configuration and a time; raise ModelError for anything else."""
-    return checked_wrenches(wrenches(time, machine.tip_pose(base, q).position) if callable(wrenches) else wrenches)
+    if not callable(wrenches):
+        return checked_wrenches(wrenches)
+    return checked_wrenches(require.call("wrenches", wrenches, time, machine.tip_pose(base, q).position))
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:

@@ -217,7 +217,7 @@ def track_expression(
             time.
     """
     allowed = (shapes,) if isinstance(shapes[0], int) else shapes
-    value = _call_track(track, time - begin if begin else time, label) if callable(track) else track
+    value = require.call(label, track, time - begin if begin else time) if callable(track) else track
     expected = " or ".join(map(str, allowed))
     try:
         value = expression(value)
@@ -236,13 +236,3 @@ def track_expression(
         words = f"{label} depends on {others}, but only the time it is called with may occur"
         raise ProblemError(words, name=label, value=others)
     return ca.densify(value)
-
-
-def _call_track(track: Callable[[Any], Any], time: Any, label: str) -> Any:
-    """Evaluate a target function; raise ProblemError if it fails, but pass on errors that are due to SX symbols."""
-    try:
-        return track(time)
-    except (RuntimeError, NotImplementedError, ProblemError, ModelError):
-        raise
-    except Exception as error:  # raised by the function itself
-        raise ProblemError(f"{label}: the function fails: {error!r}", name=label, value=track) from error

@@ -24,6 +24,7 @@ from models import (
     rectangle,
     standing_example,
 )
+from models.machines.machine import wrenches_at
 from models.machines.standing import center_of_pressure, standing_motion, tip_spring
 from tests.models.machines.standing_machines import random_motion, random_standing, standing_arm
 from tests.models.robot.oracles import mujoco_dynamics, pinocchio_dynamics, with_masses
@@ -330,6 +331,14 @@ def test_wrenches_that_are_no_list_are_refused() -> None:
         call: Any = getattr(EXAMPLE, name)
         with pytest.raises(ModelError, match="wrenches must be a list"):
             call(rest, rest, rest, alone)
+
+
+def test_a_function_of_wrenches_with_wrong_arguments_is_refused_by_name() -> None:
+    functions: tuple[Any, ...] = (lambda: [], lambda time: [], lambda time, tip, more: [])
+    for function in functions:
+        with pytest.raises(ModelError, match=r"wrenches: the function fails: TypeError.*argument") as refusal:
+            wrenches_at(function, EXAMPLE, (), np.zeros(5), time=0.0)
+        assert refusal.value.value is function
 
 
 @pytest.mark.parametrize("times", [[], ["soon"], [np.nan]])
