@@ -306,7 +306,7 @@ def _worst_in_degrees(samples: _Samples, turning: list[int], margin: Array) -> i
 def _unwrap(samples: _Samples) -> list[Fault]:
     """Remove jumps of joint positions by full turns; return a fault for each corrected joint that has limits.
 
-    For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
+    For a joint with limits, a jump is nearly one whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.
     """
     t, q, lower, upper, velocity = samples.t, samples.q, samples.lower, samples.upper, samples.velocity
@@ -316,7 +316,7 @@ def _unwrap(samples: _Samples) -> list[Fault]:
         leaps = np.abs(np.diff(continued) - steps) > np.pi
         if kind != "continuous":
             swift = (np.abs(steps) > velocity[k] * h) | (np.abs(steps) > THRESHOLDS.hardest * h**2)
-            leaps &= swift & (np.abs(np.diff(continued)) < 0.5)
+            leaps &= swift & (np.abs(np.diff(continued)) < 0.5) & (np.abs(steps) < 3 * np.pi)
             continued = q[:, k] - np.cumsum([0.0, *np.where(leaps, steps - np.diff(continued), 0.0)])
             if continued.min() < lower[k] or continued.max() > upper[k]:
                 middle = (lower[k] + upper[k] - continued.min() - continued.max()) / 2

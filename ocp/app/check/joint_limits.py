@@ -329,6 +329,7 @@ def interpolate(times: Array, t: Array, values: Array) -> Array:
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers beyond 1e296 overflow when scaled: they have no such digits
 def half_digits(values: Array) -> Array:
     """Return the rounding error of each column of numbers: half of its last decimal or binary digit. Shape (n,).
 

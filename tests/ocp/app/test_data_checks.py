@@ -167,6 +167,15 @@ def test_a_joint_with_limits_that_was_wrapped_jumps(tmp_path: Path) -> None:
     assert fault.time == pytest.approx((np.pi - 2.5) / 0.3, abs=0.02)
 
 
+@pytest.mark.parametrize("huge", [40.0, 1e9, 1e17, 1e300])
+def test_a_jump_of_many_turns_is_not_a_wrapped_angle(tmp_path: Path, huge: float) -> None:
+    t, q, *_ = smooth()
+    q[50, 1] = huge
+    check = checked(tmp_path, URDF, NAMES, t, q, scene=False)
+    assert not any("wrapped" in fault.text for fault in check.faults)
+    assert any(fault.name == "elbow" and fault.kind == "position" for fault in check.faults), check
+
+
 def test_followers_follow(tmp_path: Path) -> None:
     t = np.linspace(0.0, 2.0, 101)
     left = 0.02 + 0.01 * np.sin(t)
