@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.console import report, time_left
+from ocp.console import TimeLimitReached, report, time_left
 from ocp.errors import SolveError
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage, ranked
 from ocp.motion.result.solved_plan import SolvedPlan
@@ -143,7 +143,10 @@ class CandidateQueue:
         while self._heap:
             candidate = heappop(self._heap)[-1]
             report(self._state, step=True)
-            if self.exhausted:
+            if time_left() <= 0:
+                late = Reason(Rejection.NOT_TRIED, "the time limit passed before it", "time_limit")
+                self.candidates.append(candidate.with_rejection(late))
+            elif self.exhausted:
                 words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
                 self.candidates.append(candidate.with_rejection(Reason(Rejection.NOT_TRIED, words)))
             elif (motion := self._find_motion(candidate)) is not None:
@@ -162,9 +165,13 @@ class CandidateQueue:
 
         Raises:
             SolveError: No candidate passed.
+            TimeLimitReached: No candidate passed before the time limit of the caller; its cause is this SolveError.
         """
         if not self.passed:
-            raise self.solver.failure(self.candidates)
+            failure = self.solver.failure(self.candidates)
+            if time_left() <= 0:
+                raise TimeLimitReached from failure
+            raise failure
         return self.solver.plan(ranked(self.candidates))
 
     @property

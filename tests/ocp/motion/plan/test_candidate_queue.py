@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp import SolveError
-from ocp.console import time_limited
+from models import FixedBase, planar_chain
+from ocp import SolveError, TipTask, plan
+from ocp.console import TimeLimitReached, time_limited
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.search.configurations import PlannerSettings
@@ -269,3 +270,37 @@ def test_after_the_refusal_time_the_rest_is_not_tried(seconds: float, monkeypatc
         assert len(kinds) == 4
         assert Rejection.AUDIT in kinds
         assert (Rejection.NOT_TRIED in kinds) == (seconds > 0 and limit is None)  # its place is taken
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_after_the_time_limit_nothing_is_solved(found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What passed before is the plan; without any, the error is that of the time limit and has the others as cause."""
+    clock = [1000.0]
+    monkeypatch.setattr("ocp.console.time.monotonic", lambda: clock[0])
+
+    class Slow(Known):
+        def advance(self, candidate: Candidate) -> list[Candidate]:
+            clock[0] += 1.0
+            return super().advance(candidate)
+
+    slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0, 2.1, 2.2, 2.3], [found] * 4)
+    with time_limited(10.5):
+        queue = CandidateQueue(slow, replace(SETTINGS, max_failures=9), include_costlier=True)
+        queue.run(seeds(range(4)))
+        assert clock[0] == 1011.0
+        late = [c for c in queue.candidates if c.reason is not None and c.reason.kind is Rejection.NOT_TRIED]
+        assert late
+        assert all("the time limit passed" in str(c.reason) for c in late)
+        if found:
+            assert queue.passed
+        else:
+            with pytest.raises(TimeLimitReached) as caught:
+                queue.plan()
+            assert isinstance(caught.value.__cause__, SolveError)
+
+
+def test_a_plan_without_time_names_the_time_limit() -> None:
+    task = TipTask(position=[0.9, 0.2, 0.0], rows=[3, 4], duration=1.0)
+    with pytest.raises(SolveError, match="within the time limit of 1e-06 s; raise time_limit") as caught:
+        plan(FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0, 1.0, 1.0])), task, 1.0, time_limit=1e-6)
+    assert (caught.value.name, caught.value.limit) == ("time_limit", 1e-6)
