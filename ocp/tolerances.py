@@ -39,8 +39,8 @@ TIGHTENED_SHARE = 0.1
 """Largest tightening of a limit, relative to the limited quantity, at which the limit may be active. Beyond that, the
 multiplier says little about the cost of the tightening."""
 IMPLIED_SHARE = 1e-4
-"""Singular value of stacked unit gradients of constraints below which the gradients may be linearly dependent within
-the error of a plan."""
+"""Factor of a constraint in a linear dependence of constraints, relative to the largest factor, below which this
+constraint takes no part in the dependence."""
 SOLVER_SHARE = 1e-6
 """Residuals to expect from a solver (1e-8 in its scaled variables), relative to the largest value of their kind."""
 RESOLVED_SHARE = 10 * SOLVER_SHARE

@@ -272,8 +272,8 @@ def test_after_the_refusal_time_the_rest_is_not_tried(seconds: float, monkeypatc
         assert (Rejection.NOT_TRIED in kinds) == (seconds > 0 and limit is None)  # its place is taken
 
 
-@pytest.mark.parametrize("found", [False, True])
-def test_after_the_time_limit_nothing_is_solved(found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("passes", [False, True])
+def test_after_the_time_limit_nothing_is_solved(passes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """What passed before is the plan; without any, the error is that of the time limit and has the others as cause."""
     clock = [1000.0]
     monkeypatch.setattr("ocp.console.time.monotonic", lambda: clock[0])
@@ -283,7 +283,7 @@ def test_after_the_time_limit_nothing_is_solved(found: bool, monkeypatch: pytest
             clock[0] += 1.0
             return super().advance(candidate)
 
-    slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0, 2.1, 2.2, 2.3], [found] * 4)
+    slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0, 2.1, 2.2, 2.3], [passes] * 4)
     with time_limited(10.5):
         queue = CandidateQueue(slow, replace(SETTINGS, max_failures=9), include_costlier=True)
         queue.run(seeds(range(4)))
@@ -291,7 +291,7 @@ def test_after_the_time_limit_nothing_is_solved(found: bool, monkeypatch: pytest
         late = [c for c in queue.candidates if c.reason is not None and c.reason.kind is Rejection.NOT_TRIED]
         assert late
         assert all("the time limit passed" in str(c.reason) for c in late)
-        if found:
+        if passes:
             assert queue.passed
         else:
             with pytest.raises(TimeLimitReached) as caught:
