@@ -168,7 +168,7 @@ def _refine_mesh(
         beyond = [row for row in rows if not row.value <= 1.0]
         intervals.append(method.intervals)
         for kind, values in errors.items():
-            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
+            values.append(_largest_error(rows, kind))
         progress.record({row.name: row.unresolved(np.diff(method.fractions)) for row in beyond})
         idle = min(progress.vain.values(), default=0)
         at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
@@ -182,8 +182,7 @@ def _refine_mesh(
             parts = _parts_per_interval(beyond, rows, method.fractions, settings)
             following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
         unchanged = np.array_equal(following.fractions, method.fractions)
-        rounds = [progress.vain[name] + settings.patience * unchanged for name in driven & progress.vain.keys()]
-        vainly = max(rounds, default=0) >= settings.patience
+        vainly = progress.is_vain(driven, settings.patience * (not unchanged))
         if isinstance(method, Collocation) and method.control == "points" and vainly:
             # held over each interval, controls that oscillate on every mesh have no values but those of the solver
             following, moving, unchanged = replace(method, control="held"), False, False
@@ -205,6 +204,11 @@ def _refine_mesh(
     return replace(solution, refinement=refinement), audit
 
 
+def _largest_error(rows: list[_Row], kind: str) -> float:
+    """Return the largest error of one kind relative to its limit, 0 if there is none."""
+    return max((row.value for row in rows if row.kind == kind), default=0.0)
+
+
 @dataclass
 class _Progress:
     """Progress of the errors that exceed their limits, from mesh to mesh.
@@ -224,6 +228,10 @@ class _Progress:
         improved = {name: error < self.nearer * self.best.get(name, np.inf) for name, error in errors.items()}
         self.best |= {name: min(error, self.best.get(name, np.inf)) for name, error in errors.items()}
         self.vain = {name: 0 if improved[name] else self.vain.get(name, 0) + 1 for name in errors}
+
+    def is_vain(self, names: set[str], patience: int) -> bool:
+        """Return whether an error of one of the named rows has not improved on the last `patience` meshes."""
+        return any(count >= patience for name, count in self.vain.items() if name in names)
 
 
 def _limits_of_controls(form: Formulation, solution: Solution) -> set[str]:
