@@ -182,7 +182,7 @@ def _refine_mesh(
             parts = _parts_per_interval(beyond, rows, method.fractions, settings)
             following = method.with_mesh(split(method.fractions, *parts, settings.max_intervals))
         unchanged = np.array_equal(following.fractions, method.fractions)
-        vainly = progress.is_vain(driven, settings.patience * (not unchanged))
+        vainly = progress.is_vain(driven, settings.patience, unchanged)
         if isinstance(method, Collocation) and method.control == "points" and vainly:
             # held over each interval, controls that oscillate on every mesh have no values but those of the solver
             following, moving, unchanged = replace(method, control="held"), False, False
@@ -229,9 +229,9 @@ class _Progress:
         self.best |= {name: min(error, self.best.get(name, np.inf)) for name, error in errors.items()}
         self.vain = {name: 0 if improved[name] else self.vain.get(name, 0) + 1 for name in errors}
 
-    def is_vain(self, names: set[str], patience: int) -> bool:
-        """Return whether an error of one of the named rows has not improved on the last `patience` meshes."""
-        return any(count >= patience for name, count in self.vain.items() if name in names)
+    def is_vain(self, names: set[str], patience: int, unchanged: bool) -> bool:
+        """Return whether an error of a named row has not improved on `patience` meshes, or no mesh is finer."""
+        return any(unchanged or count >= patience for name, count in self.vain.items() if name in names)
 
 
 def _limits_of_controls(form: Formulation, solution: Solution) -> set[str]:

@@ -288,6 +288,7 @@ def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, roundin
 
 
 def _distance_of_cores(first: Core, second: Core, rounding: float, stop_gradient: StopGradient) -> Any:
+    """Return the signed distance of two cores, m, smooth within the width `rounding`."""
     if isinstance(first, PlaneCore):
         return _least_height(second, first.normal, first.point, rounding)
     if isinstance(second, PlaneCore):

@@ -49,9 +49,7 @@ MARGIN_M = 1e-6
 class ProofSettings:
     """Limits of the computing effort to prove that a pair of bodies need not be checked for collision."""
 
-    configurations: int = (
-        1000  # random configurations; bodies that collide in all of them are assumed to collide always
-    )
+    configurations: int = 1000  # random configurations: bodies that collide in all of them count as always colliding
     first_configurations: int = 24  # random configurations that are tried before a proof
     boxes: int = 2000  # boxes of joint positions that a proof may use with up to three joints between the bodies
     rounds: int = 40  # bisections of the boxes

@@ -186,7 +186,8 @@ class Flow:
         """
         cells, each = np.arange(len(chain)), len(chain) // self._intervals
         values = np.full((len(chain), starts.shape[1] + 1), np.nan)
-        cell, place, width = steps or Steps(cells, (cells % each) / each, np.full(len(chain), 1.0 / each))
+        even = Steps(cells, (cells % each) / each, np.full(len(chain), 1.0 / each))
+        cell, place, width = even if steps is None else steps
         current = np.hstack([starts, np.zeros((len(starts), 1))])
         accepted: list[Steps] = []
         for _ in range(SETTINGS.rounds):

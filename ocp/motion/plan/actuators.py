@@ -296,8 +296,8 @@ def _ramps(
     rates = unlimited.sampled(np.linspace(0.0, unlimited.horizon, CHECKED_TIMES)).rates
     rates = rates[:, [name not in unlimited.held for name in unlimited.names]]
     fastest = [np.minimum(most, 1.0 / STANDSTILL).tolist() for most in (bounds.acceleration, bounds.jerk)]
-    for k, (rests, rows) in enumerate(zip(request.rests, rest_rows, strict=True)):
-        speeds = np.abs(rows.T @ (rows @ rates[-k]))
+    for k, (rests, rows, end) in enumerate(zip(request.rests, rest_rows, rates[[0, -1]], strict=True)):
+        speeds = np.abs(rows.T @ (rows @ end))
         share = rests * max(map(ramp_time, speeds.tolist(), *fastest)) / horizon
         if rests and not has_jerks and speeds.max() > LIMIT_SHARE * np.abs(rates).max():
             share = max(share, Actuation.smoothing)
