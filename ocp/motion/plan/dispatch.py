@@ -134,7 +134,8 @@ def plan(
             if time_limit is None:  # that of an outer call
                 raise
             words = f"no motion was found within the time limit of {time_limit:g} s; raise time_limit{error.advice}"
-            raise SolveError(words, name="time_limit", limit=time_limit) from error
+            tried = getattr(error.__cause__, "candidates", ())  # with the reasons of those that were tried in time
+            raise SolveError(words, candidates=tried, name="time_limit", limit=time_limit) from error
 
 
 def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanOptions) -> Plan:

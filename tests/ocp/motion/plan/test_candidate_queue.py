@@ -304,3 +304,5 @@ def test_a_plan_without_time_names_the_time_limit() -> None:
     with pytest.raises(SolveError, match="within the time limit of 1e-06 s; raise time_limit") as caught:
         plan(FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0, 1.0, 1.0])), task, 1.0, time_limit=1e-6)
     assert (caught.value.name, caught.value.limit) == ("time_limit", 1e-6)
+    assert {each.reason.kind for each in caught.value.candidates if each.reason} == {Rejection.NOT_TRIED}
+    assert caught.value.candidates
