@@ -25,6 +25,7 @@ from models.paths.blends import (
     GAUSS_WEIGHTS,
     BlendKind,
     Cells,
+    curvature,
     derivative_of_columns,
     derivatives_by_arc_length,
     horner,
@@ -181,7 +182,7 @@ class SmoothPath:
 
     def curvature(self, distance: ArrayInput) -> Array:
         """Return the curvature at given distances from the start of the path. Shape (M,), 1/m."""
-        return np.asarray(np.linalg.norm(self.at(distance).curvature, axis=1))
+        return _in_blocks(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
         """Return tool orientations, and derivatives of them by arc length, at distances (M,), m, from the path's start.
@@ -267,6 +268,15 @@ class SmoothPath:
             for result, value in zip(results, derivatives_by_arc_length(self.coefficients[curve], u), strict=True):
                 result[curved] = value
         return results
+
+    def _curvature(self, s: Array) -> tuple[Array]:
+        """Return curvatures at distances (M,) along the path, for a fifth of the work of `at`. Shape (M, 1), 1/m."""
+        piece = self._piece(s)
+        values = np.abs(self.path.curvature[self.piece_segment[piece]])
+        curved = np.flatnonzero(self.piece_curve[piece] >= 0)
+        curve, u = self._parameter(s[curved])
+        values[curved] = curvature(self.coefficients[curve], u)
+        return (values[:, None],)
 
     def _turn(self, s: Array) -> tuple[Array, ...]:
         piece, (reference, theta) = self._piece(s), self.charts
